@@ -1,0 +1,34 @@
+# make install | quickstart | test: each prepares what it needs and can be repeated.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: install quickstart smoke test check clean
+install: $(VENV)/installed
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	@echo "installing PyTorch ..."
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
+	@echo "installing oodil and what it needs ..."
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test]"
+	@touch $@
+	@echo "installed; try: $(BIN)/oodil --help"
+
+quickstart: install
+	$(BIN)/oodil run configs/quickstart.yaml
+
+smoke: install
+	$(BIN)/oodil run configs/smoke.yaml
+
+check: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: check
+	$(BIN)/python -m pytest
+
+clean:
+	rm -rf $(VENV) runs build *.egg-info

@@ -1,0 +1,35 @@
+"""Generalised advantage estimation. Letters: T steps, G simulators."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+
+def generalised_advantages(
+    rewards: Array,
+    values: Array,
+    next_values: Array,
+    terminated: NDArray[np.bool_],
+    truncated: NDArray[np.bool_],
+    discount: float,
+    gae_lambda: float,
+) -> Array:
+    """Return (T, G) advantages; the sum is cut where an episode ends.
+
+    A terminated step has no future value; a truncated one (a time limit) bootstraps from ``next_values``, and so does
+    the last step of the rollout. All arrays are (T, G).
+    """
+    errors = rewards + discount * next_values * ~terminated - values
+    decay = np.float32(discount * gae_lambda) * ~(terminated | truncated)
+    advantages = np.empty_like(errors)
+    running = np.zeros(rewards.shape[1], np.float32)
+    for t in range(len(rewards) - 1, -1, -1):
+        running = errors[t] + decay[t] * running
+        advantages[t] = running
+    return advantages
+
+
+def standardised(advantages: Array) -> Array:
+    """Return advantages with mean 0 and standard deviation 1 over the batch."""
+    return np.asarray((advantages - advantages.mean()) / (advantages.std() + 1e-8))

@@ -1,0 +1,236 @@
+"""Contrastive clustering, phase 1 of the method (Algorithm 1 of the appendix, docs/algorithms.md).
+
+The encoder is trained first by the contrastive loss alone, then together with K centres that follow their members as
+running means. Unlike the paper, the counters of these means start above zero, as in the official code, centres stay on
+the unit sphere, and the final label of a demonstration comes from the mean feature of several sub-trajectories.
+
+Letters: N demonstrations, B batch, l states of a sub-trajectory, S observation, E embedding, K clusters.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.cluster import KMeans
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pipeline.algorithms.contrastive import Encoder, Sampling, Subtrajectories, contrastive_loss, standardisation
+from pipeline.algorithms.optimiser import Adam
+from pipeline.config import ClusteringConfig
+from pipeline.data import DataError, Demonstrations
+from pipeline.seeding import Key, derive_key, generator, torch_seed
+
+ENCODED_AT_ONCE = 1024
+"""Sub-trajectories per pass outside training; it bounds the memory."""
+
+
+def assign(features: Tensor, centres: Tensor) -> Tensor:
+    """Return (...) int64 ids of the nearest of (K, E) centres for (..., E) features, Eqn (2)."""
+    # ||f - c||^2 = ||f||^2 + ||c||^2 - 2 <f, c>, and the first term is the same for every centre.
+    return (centres.square().sum(-1) - 2 * features @ centres.T).argmin(-1)
+
+
+def centre_loss(features: Tensor, own_centres: Tensor, reduction: str) -> Tensor:
+    """Return ||F(xi) - C y||^2 / 2, the second term of Eqn (3) without lambda, as sum or mean; both are (2B, E)."""
+    distances = 0.5 * (features - own_centres).square().sum(-1)
+    return distances.sum() if reduction == "sum" else distances.mean()
+
+
+def moved_centres(centres: Tensor, counts: Tensor, features: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    """Return centres (K, E) and counters (K,) after Eqn (4) for all samples in sequence.
+
+    The running mean of m samples that begins at (n, c) ends at (n c + sum f) / (n + m), whatever their order.
+
+    Args:
+        centres, counts: (K, E) float32 and (K,) int64 as they stand.
+        features, labels: (2B, E) and (2B,) int64 in [0, K).
+    """
+    new = torch.bincount(labels, minlength=len(centres))
+    sums = torch.zeros_like(centres).index_add_(0, labels, features)
+    # In this form a centre without new members keeps its bits.
+    moved = centres + (sums - new[:, None] * centres) / (counts + new)[:, None]
+    return moved, counts + new
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """What a cluster model says about N demonstrations."""
+
+    labels: NDArray[np.int32]
+    """(N,) cluster ids."""
+    features: NDArray[np.float32]
+    """(N, E) unit features."""
+    stability: float
+    """Share of single draws whose own label is the final one."""
+
+
+@dataclass(frozen=True)
+class ClusterModel:
+    """A frozen encoder and its centres: all that is needed to label demonstrations, old or new."""
+
+    encoder: Encoder
+    centres: Tensor
+    """(K, E)"""
+    counts: Tensor
+    """(K,) int64 counters of Eqn (4)."""
+    sampling: Sampling
+    state_mean: NDArray[np.float32]
+    """(S,) subtracted from the states."""
+    state_scale: NDArray[np.float32]
+    """(S,) multiplied afterwards."""
+
+    @torch.no_grad()
+    def label(self, demonstrations: Demonstrations, draws: int, root_seed: int) -> Labelling:
+        """Label each demonstration by the centre nearest to the mean feature of ``draws`` sub-trajectories of it.
+
+        Raises DataError when the states have another dimension than those of the training set.
+        """
+        if demonstrations.observation_dim != len(self.state_mean):
+            raise DataError(
+                f"states have {demonstrations.observation_dim} dimensions; the clusters were learned "
+                f"from states with {len(self.state_mean)}"
+            )
+        subtrajectories = Subtrajectories(demonstrations, self.sampling, self.state_mean, self.state_scale)
+        everyone = np.arange(len(demonstrations))
+        features = torch.stack(
+            [
+                _encode(self.encoder, subtrajectories, everyone, derive_key(root_seed, "clustering", "label", draw))
+                for draw in range(draws)
+            ]
+        )
+        mean = normalize(features.mean(0), dim=-1)
+        labels = assign(mean, self.centres)
+        stability = float((assign(features, self.centres) == labels).double().mean())
+        return Labelling(labels.numpy().astype(np.int32), mean.numpy(), stability)
+
+    def arrays(self) -> dict[str, NDArray]:
+        """Return everything by name, for a file; `from_arrays` is the inverse."""
+        return {name: value.numpy() for name, value in self.encoder.state_dict().items()} | {
+            "centres": self.centres.numpy(),
+            "counts": self.counts.numpy(),
+            "length": np.array([self.sampling.length], np.int32),
+            "stride": np.array([self.sampling.stride], np.int32),
+            "state_mean": self.state_mean,
+            "state_scale": self.state_scale,
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, NDArray]) -> "ClusterModel":
+        """Rebuild a model from `arrays`. Raises ValueError when a name is missing or shapes do not fit."""
+        try:
+            centres, counts = torch.from_numpy(arrays["centres"]), torch.from_numpy(arrays["counts"])
+            sampling = Sampling(length=int(arrays["length"][0]), stride=int(arrays["stride"][0]))
+            mean, scale = arrays["state_mean"], arrays["state_scale"]
+            encoder = Encoder(len(mean), centres.shape[1], torch.Generator())
+            encoder.load_state_dict({name: torch.from_numpy(arrays[name]) for name in encoder.state_dict()})
+        except KeyError as error:
+            raise ValueError(f"cluster model has no array {error.args[0]!r}") from None
+        except (RuntimeError, IndexError) as error:
+            raise ValueError(f"arrays of the cluster model do not fit together: {error}") from error
+        return cls(encoder, centres, counts, sampling, mean, scale)
+
+
+class ContrastiveClustering:
+    """Algorithm 1, one iteration per call; all that it remembers is in `state`."""
+
+    def __init__(self, demonstrations: Demonstrations, config: ClusteringConfig, root_seed: int) -> None:
+        """Prepare the encoder. Raises DataError when there are fewer demonstrations than clusters."""
+        if len(demonstrations) < config.num_clusters:
+            raise DataError(f"{len(demonstrations)} demonstrations cannot form {config.num_clusters} clusters")
+        self.config = config
+        self.root_seed = root_seed
+        # One cluster takes everything in, whatever the encoder says.
+        self._warmup = config.warmup_iterations if config.num_clusters > 1 else 0
+        self.num_iterations = self._warmup + config.joint_iterations if config.num_clusters > 1 else 0
+        self.iteration = 0
+        dim = demonstrations.observation_dim
+        self._state_mean, self._state_scale = np.zeros(dim, np.float32), np.ones(dim, np.float32)
+        if config.standardise_states:
+            self._state_mean, self._state_scale = standardisation(demonstrations.observations)
+        self._subtrajectories = Subtrajectories(
+            demonstrations, Sampling.plan(demonstrations.lengths, config), self._state_mean, self._state_scale
+        )
+        rng = torch.Generator().manual_seed(torch_seed(self._key("encoder")))
+        self.encoder = Encoder(dim, config.hidden, rng)
+        self._optimiser = Adam(list(self.encoder.parameters()), config.learning_rate, config.weight_decay)
+        self.centres = torch.zeros(config.num_clusters, config.hidden)
+        self.counts = torch.full((config.num_clusters,), config.initial_count)
+        if self._warmup == 0:
+            self._place_centres()
+
+    def update(self) -> dict[str, float]:
+        """Do one iteration and return metrics: loss, contrastive_loss."""
+        config = self.config
+        rng = generator(self._key("batch", self.iteration))
+        chosen = rng.permutation(len(self._subtrajectories))[: config.batch_size]
+        views = self._subtrajectories.draw(np.concatenate((chosen, chosen)), rng)
+        features = self.encoder(views)
+        contrastive = loss = contrastive_loss(features, config.temperature)
+        joint = self.iteration >= self._warmup
+        if joint:
+            labels = assign(features.detach(), self.centres)
+            if config.update_order == "centres_first":
+                self._move_centres(features.detach(), labels)
+            loss = loss + config.centre_weight * centre_loss(features, self.centres[labels], config.reduction)
+        self._optimiser.step(loss)
+        if joint and config.update_order == "step_first":
+            with torch.no_grad():
+                features = self.encoder(views)
+            self._move_centres(features, assign(features, self.centres))
+        self.iteration += 1
+        if self.iteration == self._warmup:
+            self._place_centres()
+        return {"loss": float(loss.detach()), "contrastive_loss": float(contrastive.detach())}
+
+    def model(self) -> ClusterModel:
+        """Return the encoder and the centres as they stand."""
+        sampling = self._subtrajectories.sampling
+        return ClusterModel(self.encoder, self.centres, self.counts, sampling, self._state_mean, self._state_scale)
+
+    def state(self) -> dict[str, NDArray]:
+        """Return everything that later iterations depend on."""
+        tensors = {f"encoder/{name}": value for name, value in self.encoder.state_dict().items()}
+        tensors |= {f"optimiser/{name}": value for name, value in self._optimiser.state().items()}
+        tensors |= {"centres": self.centres, "counts": self.counts, "iteration": torch.tensor([self.iteration])}
+        return {name: value.numpy() for name, value in tensors.items()}
+
+    def load_state(self, state: dict[str, NDArray]) -> None:
+        """Continue from `state`."""
+        tensors = {name: torch.from_numpy(value) for name, value in state.items()}
+
+        def below(prefix: str) -> dict[str, Tensor]:
+            return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+        self.encoder.load_state_dict(below("encoder/"))
+        self._optimiser.load_state(below("optimiser/"))
+        self.centres, self.counts = tensors["centres"], tensors["counts"]
+        self.iteration = int(tensors["iteration"])
+
+    @torch.no_grad()
+    def _place_centres(self) -> None:
+        """Initialise the centres: features of K random demonstrations, or the k-means of all of them."""
+        rng = generator(self._key("centres"))
+        count = len(self._subtrajectories)
+        if self.config.initial_centres == "trajectories":
+            chosen = rng.permutation(count)[: self.config.num_clusters]
+            centres = _encode(self.encoder, self._subtrajectories, chosen, self._key("centres", "views"))
+        else:
+            features = _encode(self.encoder, self._subtrajectories, np.arange(count), self._key("centres", "views"))
+            kmeans = KMeans(self.config.num_clusters, n_init=10, random_state=int(rng.integers(2**31)))
+            centres = torch.from_numpy(kmeans.fit(features.numpy()).cluster_centers_)
+        self.centres = normalize(centres, dim=-1) if self.config.normalise_centres else centres
+
+    def _move_centres(self, features: Tensor, labels: Tensor) -> None:
+        centres, self.counts = moved_centres(self.centres, self.counts, features, labels)
+        self.centres = normalize(centres, dim=-1) if self.config.normalise_centres else centres
+
+    def _key(self, *path: str | int) -> Key:
+        return derive_key(self.root_seed, "clustering", *path)
+
+
+def _encode(encoder: Encoder, subtrajectories: Subtrajectories, chosen: NDArray[np.int64], key: Key) -> Tensor:
+    """Return (B, E) features of one sub-trajectory, drawn with ``key``, of each of the (B,) chosen demonstrations."""
+    views = subtrajectories.draw(chosen, generator(key))
+    return torch.cat([encoder(part) for part in views.split(ENCODED_AT_ONCE, dim=1)])

@@ -1,0 +1,55 @@
+"""The discriminator of GAIL on state pairs (s, s'), the paper's Eqn (5) and (8).
+
+One convention everywhere: logits are high for demonstrations, ``D = sigmoid(logit)`` is the probability that a pair
+comes from a demonstration, label 1 is the demonstration and 0 the policy. The paper writes the opposite class as 1.
+
+Letters: B batch, M demonstration pairs, S observation.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from pipeline.algorithms.networks import MLP
+from pipeline.algorithms.optimiser import Adam
+from pipeline.config import DiscriminatorConfig
+
+
+def discriminator_loss(demonstration_logits: Tensor, policy_logits: Tensor) -> Tensor:
+    """Return the binary cross-entropy -E_demo log D - E_policy log(1 - D), each term averaged; logits are (M,), (B,)."""
+    return softplus(-demonstration_logits).mean() + softplus(policy_logits).mean()
+
+
+def imitation_reward(logits_expert_is_high: Tensor) -> Tensor:
+    """Return -log(1 - D), (B,): positive, and large where a pair looks like a demonstration (method: reward of GAIL).
+
+    A positive reward also pays for staying alive; see docs/algorithms.md.
+    """
+    return softplus(logits_expert_is_high)
+
+
+class Discriminator(nn.Module):
+    """A network on pairs (s, s') and its optimiser."""
+
+    def __init__(self, observation_dim: int, config: DiscriminatorConfig, rng: torch.Generator) -> None:
+        super().__init__()
+        self.config = config
+        self.net = MLP(2 * observation_dim, config.hidden, 1, rng)
+        self.optimiser = Adam(list(self.parameters()), config.learning_rate)
+
+    def forward(self, pairs: Tensor) -> Tensor:
+        """Return (B,) logits of (B, 2S) pairs; high for demonstrations."""
+        return self.net(pairs).squeeze(-1)
+
+    def update(self, demonstration_pairs: Tensor, policy_pairs: Tensor) -> dict[str, float]:
+        """Take one full-batch step on (M, 2S) demonstration pairs against (B, 2S) policy pairs."""
+        count = len(demonstration_pairs)
+        logits = self(torch.cat((demonstration_pairs, policy_pairs)))
+        loss = discriminator_loss(logits[:count], logits[count:])
+        self.optimiser.step(loss)
+        with torch.no_grad():
+            return {
+                "discriminator_loss": float(loss),
+                "demonstration_accuracy": float((logits[:count] > 0).float().mean()),
+                "policy_accuracy": float((logits[count:] < 0).float().mean()),
+            }

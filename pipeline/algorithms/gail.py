@@ -1,0 +1,87 @@
+"""Generative adversarial imitation from states, with weighted demonstrations: the paper's Eqn (5), (7) and (8).
+
+Uniform weights over a cluster's demonstrations give a transferability job, uniform weights over all demonstrations give
+naive GAIL, and weights from the transferability give the method itself.
+
+Letters: N demonstrations, M transitions of all of them, B policy pairs, S observation.
+"""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipeline.algorithms.discriminator import Discriminator, imitation_reward
+from pipeline.algorithms.learner import side_by_side
+from pipeline.config import DiscriminatorConfig
+from pipeline.data import Demonstrations
+from pipeline.rollout import Rollout
+from pipeline.seeding import derive_key, generator, torch_seed
+
+
+class AdversarialReward:
+    """A discriminator as reward model: it rewards what looks like the weighted demonstrations."""
+
+    def __init__(
+        self,
+        demonstrations: Demonstrations,
+        weights: NDArray[np.float64],
+        config: DiscriminatorConfig,
+        root_seed: int,
+    ) -> None:
+        """Prepare to draw pairs in proportion to ``weights`` (N,), one per demonstration (Eqn 7).
+
+        Raises ValueError unless the weights are finite, not negative and not all zero.
+        """
+        if weights.shape != (len(demonstrations),) or not np.isfinite(weights).all() or (weights < 0).any():
+            raise ValueError(f"weights must be {len(demonstrations)} finite numbers >= 0, one per demonstration")
+        if weights.sum() <= 0:
+            raise ValueError("all weights are zero: there is nothing to imitate")
+        self.root_seed = root_seed
+        self._starts = demonstrations.transition_starts()
+        self._cumulative = np.cumsum(np.repeat(weights, demonstrations.lengths - 1))
+        self._observations = demonstrations.observations
+        rng = torch.Generator().manual_seed(torch_seed(derive_key(root_seed, "discriminator", "initial")))
+        self.discriminator = Discriminator(demonstrations.observation_dim, config, rng)
+
+    @torch.no_grad()
+    def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:
+        """Return (T, G) rewards of the discriminator before its own step of the same iteration."""
+        rewards = imitation_reward(self.discriminator(_policy_pairs(rollouts))).numpy()
+        return rewards.reshape(rollouts[0].terminated.shape[0], -1)
+
+    def update(self, rollouts: list[Rollout], iteration: int) -> dict[str, float]:
+        """Step the discriminator on the rollouts against as many demonstration pairs, or all of them if fewer."""
+        policy_pairs = _policy_pairs(rollouts)
+        rng = generator(derive_key(self.root_seed, "discriminator", iteration))
+        count = min(len(self._starts), len(policy_pairs))
+        metrics: dict[str, float] = {}
+        for _ in range(self.discriminator.config.steps_per_iteration):
+            metrics = self.discriminator.update(self.draw(count, rng), policy_pairs)
+        return metrics
+
+    def draw(self, count: int, rng: np.random.Generator) -> Tensor:
+        """Draw (count, 2S) demonstration pairs with replacement, in proportion to the weights."""
+        points = rng.random(count) * self._cumulative[-1]
+        chosen = np.searchsorted(self._cumulative, points, side="right")
+        starts = self._starts[np.minimum(chosen, len(self._starts) - 1)]
+        pairs = np.concatenate((self._observations[starts], self._observations[starts + 1]), axis=1)
+        return torch.from_numpy(pairs)
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the discriminator and its optimiser."""
+        state = {f"net/{name}": value for name, value in self.discriminator.state_dict().items()}
+        return state | {f"optimiser/{name}": value for name, value in self.discriminator.optimiser.state().items()}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state`."""
+        self.discriminator.load_state_dict({k[4:]: v for k, v in state.items() if k.startswith("net/")})
+        moments = {k[10:]: v for k, v in state.items() if k.startswith("optimiser/")}
+        self.discriminator.optimiser.load_state(moments)
+
+
+def _policy_pairs(rollouts: list[Rollout]) -> Tensor:
+    """Return (B, 2S): each state with its successor, step by step, groups side by side."""
+    states = side_by_side([r.observations for r in rollouts])
+    successors = side_by_side([r.next_observations for r in rollouts])
+    return torch.from_numpy(np.concatenate((states, successors), axis=2)).flatten(0, 1)

@@ -1,0 +1,174 @@
+"""One on-policy learner for every use: a generator, a value function, and a source of reward.
+
+An iteration is: reward from the model as it stands -> advantages -> policy step -> value fit -> the reward model's own
+step. Experts learn from the environment's reward, imitators from a discriminator; nothing else differs.
+
+Letters: T steps, G simulators (all groups side by side), B = T * G, S observation, A action.
+"""
+
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipeline.algorithms.advantages import generalised_advantages, standardised
+from pipeline.algorithms.networks import PolicyNetwork
+from pipeline.algorithms.ppo import Ppo
+from pipeline.algorithms.trpo import Trpo
+from pipeline.algorithms.value import ValueFunction
+from pipeline.config import TrainingConfig
+from pipeline.policy import GaussianPolicy
+from pipeline.rollout import Rollout
+from pipeline.seeding import derive_key, torch_seed
+
+Arrays = dict[str, NDArray]
+
+
+class RewardModel(Protocol):
+    """Where an iteration's rewards come from."""
+
+    def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:
+        """Return (T, G) rewards."""
+
+    def update(self, rollouts: list[Rollout], iteration: int) -> dict[str, float]:
+        """Learn from the iteration's rollouts and return metrics."""
+
+    def state(self) -> dict[str, Tensor]:
+        """Return everything needed to continue."""
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state`."""
+
+
+class EnvReward:
+    """The environment's own reward: for training experts, and for nothing else."""
+
+    def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:
+        """Return the (T, G) rewards of the environment."""
+        return side_by_side([r.env_rewards for r in rollouts]).astype(np.float32)
+
+    def update(self, rollouts: list[Rollout], iteration: int) -> dict[str, float]:
+        """There is nothing to learn."""
+        return {}
+
+    def state(self) -> dict[str, Tensor]:
+        """There is nothing to keep."""
+        return {}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """There is nothing to load."""
+
+
+def side_by_side(parts: list[NDArray]) -> NDArray:
+    """Join the groups' (T, g, ...) arrays to (T, G, ...), in group order."""
+    return np.concatenate(parts, axis=1)
+
+
+class Learner:
+    """Policy, value function and reward model, and how one iteration changes them."""
+
+    def __init__(
+        self, observation_dim: int, action_dim: int, config: TrainingConfig, reward_model: RewardModel, root_seed: int
+    ) -> None:
+        self.config = config
+        self.reward_model = reward_model
+        self.root_seed = root_seed
+        self._reward_scale = 1 - config.discount if config.scale_rewards else 1.0
+        rng = torch.Generator().manual_seed(torch_seed(derive_key(root_seed, "learner", "initial")))
+        self.policy = PolicyNetwork(observation_dim, action_dim, config.policy_hidden, rng)
+        with torch.no_grad():
+            self.policy.log_std.fill_(config.initial_log_std)
+        self.value = ValueFunction(observation_dim, config.value, rng)
+        self.generator = (
+            Trpo(self.policy, config.generator)
+            if config.generator.kind == "trpo"
+            else Ppo(self.policy, config.generator)
+        )
+        self._moments = torch.zeros(1 + 2 * observation_dim, dtype=torch.float64)
+
+    def behaviour_policy(self) -> GaussianPolicy:
+        """Return a copy of the present policy, ready to be sent."""
+        return self.policy.export()
+
+    def update(self, rollouts: list[Rollout], iteration: int) -> dict[str, float]:
+        """Learn from one iteration's rollouts, given in group order, and return metrics."""
+        config = self.config
+        rng = torch.Generator().manual_seed(torch_seed(derive_key(self.root_seed, "learner", iteration)))
+        observations = torch.from_numpy(side_by_side([r.observations for r in rollouts]))
+        actions = torch.from_numpy(side_by_side([r.actions for r in rollouts]))
+        log_probs = torch.from_numpy(side_by_side([r.log_probs for r in rollouts]))
+        terminated = side_by_side([r.terminated for r in rollouts])
+        truncated = side_by_side([r.truncated for r in rollouts])
+        # Scaled by 1 - discount, values are averages of rewards: of order one, whatever the horizon.
+        rewards = self.reward_model.rewards(rollouts) * np.float32(self._reward_scale)
+        flat = observations.flatten(0, 1)
+        if config.normalise_observations:
+            self._track(flat)
+        inputs = self.policy.normalise(flat)
+        values, next_values = self._values(inputs, rollouts, terminated | truncated)
+        advantages = generalised_advantages(
+            rewards, values, next_values, terminated, truncated, config.discount, config.gae_lambda
+        )
+        metrics = {"reward": float(rewards.mean())}
+        metrics |= self.generator.update(
+            flat,
+            actions.flatten(0, 1),
+            log_probs.flatten(),
+            torch.from_numpy(standardised(advantages)).flatten(),
+            rng,
+            1 - iteration / config.num_iterations,
+        )
+        metrics |= self.value.fit(inputs, torch.from_numpy(advantages + values).flatten(), rng)
+        metrics |= self.reward_model.update(rollouts, iteration)
+        return metrics
+
+    @torch.no_grad()
+    def _values(
+        self, inputs: Tensor, rollouts: list[Rollout], ended: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        # The next state's value is the next row's, but for episode ends and the last row: only those cost a pass.
+        values = self.value(inputs).numpy().reshape(ended.shape)
+        next_values = np.empty_like(values)
+        next_values[:-1] = values[1:]
+        apart = ended.copy()
+        apart[-1] = True
+        next_observations = side_by_side([r.next_observations for r in rollouts])[apart]
+        next_values[apart] = self.value(self.policy.normalise(torch.from_numpy(next_observations))).numpy()
+        return values, next_values
+
+    @torch.no_grad()
+    def _track(self, observations: Tensor) -> None:
+        """Move the input normaliser to the mean and deviation of all observations so far."""
+        wide = observations.double()
+        self._moments += torch.cat((torch.tensor([float(len(wide))]), wide.sum(0), wide.square().sum(0)))
+        count, (total, squares) = self._moments[0], self._moments[1:].view(2, -1)
+        mean = total / count
+        deviation = (squares / count - mean.square()).clamp_min(1e-8).sqrt()
+        self.policy.input_mean.copy_(mean)
+        self.policy.input_scale.copy_(1 / deviation)
+
+    def state(self) -> dict[str, Tensor]:
+        """Return everything that later iterations depend on, as named tensors."""
+        state = {"moments": self._moments}
+        for name, part in self._parts().items():
+            state |= {f"{name}/{key}": value for key, value in part.state().items()}
+        for name, module in (("policy", self.policy), ("value", self.value)):
+            state |= {f"{name}/{key}": value for key, value in module.state_dict().items()}
+        return state
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state`."""
+
+        def below(prefix: str) -> dict[str, Tensor]:
+            return {key[len(prefix) + 1 :]: value for key, value in state.items() if key.startswith(prefix + "/")}
+
+        self._moments.copy_(state["moments"])
+        self.policy.load_state_dict(below("policy"))
+        self.value.load_state_dict(below("value"))
+        for name, part in self._parts().items():
+            part.load_state(below(name))
+
+    def _parts(self) -> dict[str, "RewardModel | Trpo | Ppo"]:
+        return {"generator": self.generator, "value_optimiser": self.value.optimiser, "reward_model": self.reward_model}

@@ -1,0 +1,99 @@
+"""The networks of the method: two tanh layers, a small head (docs/algorithms.md).
+
+Letters: B batch, S observation, A action, H hidden.
+"""
+
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from pipeline.policy import GaussianPolicy
+
+
+class MLP(nn.Module):
+    """Linear layers with tanh between them; the head starts small (weights x 0.1, bias 0)."""
+
+    def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int, rng: torch.Generator) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise((inputs, *hidden, outputs)))
+        for layer in self.layers:
+            bound = layer.in_features**-0.5
+            nn.init.uniform_(layer.weight, -bound, bound, generator=rng)
+            nn.init.uniform_(layer.bias, -bound, bound, generator=rng)
+        with torch.no_grad():
+            self.layers[-1].weight.mul_(0.1)
+            self.layers[-1].bias.zero_()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return (B, outputs) for (B, inputs)."""
+        for layer in self.layers[:-1]:
+            x = torch.tanh(layer(x))
+        return self.layers[-1](x)
+
+    def directional_derivative(self, x: Tensor, tangents: list[Tensor]) -> Tensor:
+        """Return (B, outputs): the change of the output when the parameters move along ``tangents``.
+
+        Forward-mode differentiation by hand, one pass; ``tangents`` are ordered as `parameters()`.
+        """
+        change: Tensor | None = None
+        for i, layer in enumerate(self.layers):
+            along = torch.nn.functional.linear(x, tangents[2 * i], tangents[2 * i + 1])
+            if change is not None:
+                along = along + change @ layer.weight.T
+            if i + 1 < len(self.layers):
+                x = torch.tanh(layer(x))
+                along = along * (1 - x * x)
+            change = along
+        assert change is not None
+        return change
+
+
+class PolicyNetwork(nn.Module):
+    """Gaussian policy with a mean network and a log standard deviation that does not depend on the observation."""
+
+    input_mean: Tensor
+    input_scale: Tensor
+
+    def __init__(self, observation_dim: int, action_dim: int, hidden: tuple[int, ...], rng: torch.Generator) -> None:
+        super().__init__()
+        self.net = MLP(observation_dim, hidden, action_dim, rng)
+        self.log_std = nn.Parameter(torch.zeros(action_dim))
+        self.register_buffer("input_mean", torch.zeros(observation_dim))
+        self.register_buffer("input_scale", torch.ones(observation_dim))
+
+    def normalise(self, observations: Tensor) -> Tensor:
+        """Return (B, S) observations as the network sees them."""
+        return (observations - self.input_mean) * self.input_scale
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Return (B, A) mean actions."""
+        return self.net(self.normalise(observations))
+
+    def log_prob(self, mean: Tensor, actions: Tensor) -> Tensor:
+        """Return (B,) log-densities of ``actions`` (B, A) under the Gaussian with this ``mean`` (B, A)."""
+        standardised = (actions - mean) * torch.exp(-self.log_std)
+        constant = 0.5 * float(np.log(2 * np.pi)) * actions.shape[-1]
+        return -0.5 * standardised.square().sum(-1) - self.log_std.sum() - constant
+
+    def export(self) -> GaussianPolicy:
+        """Return a copy for rollout workers."""
+        layers = list(self.net.layers)
+        return GaussianPolicy(
+            weights=tuple(np.ascontiguousarray(layer.weight.detach().numpy().T) for layer in layers),
+            biases=tuple(layer.bias.detach().numpy().copy() for layer in layers),
+            log_std=self.log_std.detach().numpy().copy(),
+            input_mean=self.input_mean.numpy().copy(),
+            input_scale=self.input_scale.numpy().copy(),
+        )
+
+    @torch.no_grad()
+    def load(self, policy: GaussianPolicy) -> None:
+        """Take over the parameters of an exported policy; shapes must agree."""
+        for layer, weight, bias in zip(self.net.layers, policy.weights, policy.biases, strict=True):
+            layer.weight.copy_(torch.tensor(weight.T))
+            layer.bias.copy_(torch.tensor(bias))
+        self.log_std.copy_(torch.tensor(policy.log_std))
+        self.input_mean.copy_(torch.tensor(policy.input_mean))
+        self.input_scale.copy_(torch.tensor(policy.input_scale))

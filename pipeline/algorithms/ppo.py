@@ -1,0 +1,63 @@
+"""Proximal policy optimisation with the clipped surrogate (Schulman et al. 2017), https://arxiv.org/abs/1707.06347.
+
+Letters: B batch, S observation, A action.
+"""
+
+import torch
+from torch import Tensor
+
+from pipeline.algorithms.networks import PolicyNetwork
+from pipeline.algorithms.optimiser import Adam
+from pipeline.config import PpoConfig
+
+
+def clipped_surrogate(log_probs: Tensor, old_log_probs: Tensor, advantages: Tensor, clip: float) -> Tensor:
+    """Return the mean of min(r A, clip(r, 1 - clip, 1 + clip) A) with r = exp(log_probs - old_log_probs); all (B,)."""
+    ratio = torch.exp(log_probs - old_log_probs)
+    return torch.minimum(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages).mean()
+
+
+class Ppo:
+    """Several epochs of minibatch gradient steps per batch; its state is the optimiser's."""
+
+    def __init__(self, policy: PolicyNetwork, config: PpoConfig) -> None:
+        self.policy = policy
+        self.config = config
+        self._optimiser = Adam(list(policy.parameters()), config.learning_rate)
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the optimiser's moments."""
+        return self._optimiser.state()
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state`."""
+        self._optimiser.load_state(state)
+
+    def update(
+        self,
+        observations: Tensor,
+        actions: Tensor,
+        log_probs: Tensor,
+        advantages: Tensor,
+        rng: torch.Generator,
+        remaining: float,
+    ) -> dict[str, float]:
+        """Improve the policy on one batch of (B, S), (B, A), (B,) and (B,); minibatches are drawn with ``rng``.
+
+        ``remaining`` is the share of the training that lies ahead, 1 at its start.
+
+        Returns metrics: kl (of the last minibatch, estimated), entropy.
+        """
+        config, policy = self.config, self.policy
+        self._optimiser.learning_rate = config.learning_rate * (remaining if config.anneal else 1.0)
+        kl = 0.0
+        for _ in range(config.epochs):
+            for chosen in torch.randperm(len(observations), generator=rng).split(config.minibatch_size):
+                new = policy.log_prob(policy(observations[chosen]), actions[chosen])
+                old = log_probs[chosen]
+                loss = -clipped_surrogate(new, old, advantages[chosen], config.clip)
+                if config.entropy_bonus:
+                    loss = loss - config.entropy_bonus * policy.log_std.sum()
+                self._optimiser.step(loss, config.max_grad_norm)
+                kl = float((old - new.detach()).mean())
+        return {"kl": kl, "entropy": float(policy.log_std.detach().sum()) + 1.4189385 * len(policy.log_std)}

@@ -1,0 +1,49 @@
+"""From discriminators to transferability to weights: the paper's Eqn (6) and (7).
+
+Letters: N demonstrations, M transitions, E scores taken while a job ran, S observation.
+"""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from pipeline.algorithms.discriminator import Discriminator
+from pipeline.data import Demonstrations
+
+Array = NDArray[np.float64]
+
+
+@torch.no_grad()
+def mean_logit_per_demonstration(discriminator: Discriminator, demonstrations: Demonstrations) -> Array:
+    """Return (N,) discriminator logits averaged over the transitions of each demonstration."""
+    starts = demonstrations.transition_starts()
+    states = demonstrations.observations
+    pairs = torch.from_numpy(np.concatenate((states[starts], states[starts + 1]), axis=1))
+    logits = discriminator(pairs).double().numpy()
+    counts = demonstrations.lengths - 1
+    first = np.concatenate(([0], np.cumsum(counts)[:-1]))
+    return np.asarray(np.add.reduceat(logits, first) / counts)
+
+
+def transferability(mean_logits: Array) -> Array:
+    """Return sigmoid(-mean logit): 0.5 where the imitator is indistinguishable from the demonstration, 0 where it fails.
+
+    ``mean_logits`` is (N,) or (E, N), of logits that are high for demonstrations; the paper's D is one minus ours.
+    """
+    return np.asarray(expit(-mean_logits))
+
+
+def sharpened_weights(scores: Array, sharpening: float) -> Array:
+    """Return (N,) weights that sum to one, proportional to score ** sharpening; uniform when every score is zero."""
+    largest = scores.max()
+    if largest <= 0:
+        return np.full(len(scores), 1 / len(scores))
+    weights = (scores / largest) ** sharpening
+    return np.asarray(weights / weights.sum())
+
+
+def sampling_mass(weights: Array, demonstrations: Demonstrations) -> Array:
+    """Return (N,) each demonstration's share of the drawn transitions: weight times its number of transitions (Eqn 7)."""
+    mass = weights * (demonstrations.lengths - 1)
+    return np.asarray(mass / mass.sum())

@@ -1,0 +1,135 @@
+"""Trust region policy optimisation (Schulman et al. 2015), https://arxiv.org/abs/1502.05477.
+
+The step solves F x = g by conjugate gradients with Fisher-vector products computed forward-mode through the mean
+network (one pass forward, one backward, no second derivatives), then halves it until the surrogate improves inside the
+trust region. Unlike the official code of the paper we imitate, the line search checks the divergence too.
+
+Letters: B batch, S observation, A action, P parameters.
+"""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from pipeline.algorithms.networks import PolicyNetwork
+from pipeline.config import TrpoConfig
+
+
+def conjugate_gradient(product: Callable[[Tensor], Tensor], b: Tensor, iterations: int, tolerance: float) -> Tensor:
+    """Solve ``product(x) = b`` approximately for a positive definite product; vectors are (P,)."""
+    x = torch.zeros_like(b)
+    residual = b.clone()
+    direction = b.clone()
+    squared = residual @ residual
+    for _ in range(iterations):
+        if squared <= tolerance:
+            break
+        image = product(direction)
+        step = squared / (direction @ image)
+        x += step * direction
+        residual -= step * image
+        new_squared = residual @ residual
+        direction = residual + (new_squared / squared) * direction
+        squared = new_squared
+    return x
+
+
+class Trpo:
+    """One natural-gradient step per batch. It has no state besides the policy."""
+
+    def __init__(self, policy: PolicyNetwork, config: TrpoConfig) -> None:
+        self.policy = policy
+        self.config = config
+        self._parameters = list(policy.parameters())
+        self._shapes = [p.shape for p in self._parameters]
+        self._sizes = [p.numel() for p in self._parameters]
+
+    def state(self) -> dict[str, Tensor]:
+        """Return nothing: a step depends on the policy and the batch alone."""
+        return {}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Accept the empty state."""
+
+    def update(
+        self,
+        observations: Tensor,
+        actions: Tensor,
+        log_probs: Tensor,
+        advantages: Tensor,
+        rng: torch.Generator,
+        remaining: float,
+    ) -> dict[str, float]:
+        """Improve the policy on one batch.
+
+        Args:
+            observations, actions: (B, S) and (B, A).
+            log_probs: (B,) under the policy that acted; it may be one version behind.
+            advantages: (B,) standardised.
+            rng, remaining: unused; every generator has the same signature.
+        Returns metrics: kl, improvement, step_fraction (0 when the step was refused), entropy.
+        """
+        config, policy = self.config, self.policy
+        inputs = policy.normalise(observations)
+        mean = policy.net(inputs)
+        surrogate = (torch.exp(policy.log_prob(mean, actions) - log_probs) * advantages).mean()
+        gradient = _flatten(torch.autograd.grad(surrogate, self._parameters, retain_graph=True))
+        old_mean, old_log_std = mean.detach(), policy.log_std.detach().clone()
+        precision = torch.exp(-2 * old_log_std) / len(observations)
+        mean_parameters = list(policy.net.parameters())
+
+        def fisher_product(vector: Tensor) -> Tensor:
+            tangents = self._unflatten(vector)
+            by_name = dict(zip(self._parameters, tangents, strict=True))
+            with torch.no_grad():
+                change = policy.net.directional_derivative(inputs, [by_name[p] for p in mean_parameters])
+            back = torch.autograd.grad(mean, mean_parameters, change * precision, retain_graph=True)
+            images = dict(zip(mean_parameters, back, strict=True))
+            images[policy.log_std] = 2 * by_name[policy.log_std]
+            return _flatten([images[p] for p in self._parameters]) + config.damping * vector
+
+        direction = conjugate_gradient(fisher_product, gradient, config.cg_iterations, config.cg_tolerance)
+        curvature = direction @ fisher_product(direction)
+        if not bool(torch.isfinite(curvature)) or float(curvature) <= 0:
+            return {"kl": 0.0, "improvement": 0.0, "step_fraction": 0.0, "entropy": _entropy(policy)}
+        full_step = torch.sqrt(2 * config.max_kl / curvature) * direction
+        expected = float(gradient @ full_step)
+        start = _flatten([p.detach() for p in self._parameters])
+        before = float(surrogate.detach())
+        fraction = 1.0
+        with torch.no_grad():
+            for _ in range(config.backtracks):
+                self._assign(start + fraction * full_step)
+                new_mean = policy.net(inputs)
+                ratio = torch.exp(policy.log_prob(new_mean, actions) - log_probs)
+                improvement = float((ratio * advantages).mean()) - before
+                kl = float(_mean_kl(old_mean, old_log_std, new_mean, policy.log_std))
+                if improvement > config.accept_ratio * fraction * expected and kl <= 1.5 * config.max_kl:
+                    metrics = {"kl": kl, "improvement": improvement, "step_fraction": fraction}
+                    return metrics | {"entropy": _entropy(policy)}
+                fraction *= 0.5
+            self._assign(start)
+        return {"kl": 0.0, "improvement": 0.0, "step_fraction": 0.0, "entropy": _entropy(policy)}
+
+    def _unflatten(self, vector: Tensor) -> list[Tensor]:
+        return [part.view(shape) for part, shape in zip(vector.split(self._sizes), self._shapes, strict=True)]
+
+    def _assign(self, vector: Tensor) -> None:
+        for parameter, value in zip(self._parameters, self._unflatten(vector), strict=True):
+            parameter.copy_(value)
+
+
+def _flatten(tensors: list[Tensor] | tuple[Tensor, ...]) -> Tensor:
+    return torch.cat([t.reshape(-1) for t in tensors])
+
+
+def _entropy(policy: PolicyNetwork) -> float:
+    return float(policy.log_std.detach().sum()) + 1.4189385 * len(policy.log_std)
+
+
+def _mean_kl(old_mean: Tensor, old_log_std: Tensor, new_mean: Tensor, new_log_std: Tensor) -> Tensor:
+    """Return KL(old || new) of diagonal Gaussians, averaged over the batch."""
+    variance = torch.exp(2 * (old_log_std - new_log_std))
+    shift = (new_mean - old_mean).square() * torch.exp(-2 * new_log_std)
+    return (new_log_std - old_log_std + 0.5 * (variance + shift - 1)).sum(-1).mean()

@@ -1,0 +1,31 @@
+"""The value function and its fit. Letters: B batch, S observation."""
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.algorithms.networks import MLP
+from pipeline.algorithms.optimiser import Adam
+from pipeline.config import ValueConfig
+
+
+class ValueFunction(nn.Module):
+    """A network that predicts discounted imitation returns, fitted by minibatch regression."""
+
+    def __init__(self, observation_dim: int, config: ValueConfig, rng: torch.Generator) -> None:
+        super().__init__()
+        self.config = config
+        self.net = MLP(observation_dim, config.hidden, 1, rng)
+        self.optimiser = Adam(list(self.parameters()), config.learning_rate)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Return (B,) values of (B, S) normalised observations."""
+        return self.net(inputs).squeeze(-1)
+
+    def fit(self, inputs: Tensor, targets: Tensor, rng: torch.Generator) -> dict[str, float]:
+        """Regress ``targets`` (B,) on ``inputs`` (B, S), each epoch in fresh random minibatches."""
+        loss = torch.zeros(())
+        for _ in range(self.config.epochs):
+            for chosen in torch.randperm(len(inputs), generator=rng).split(self.config.minibatch_size):
+                loss = (self(inputs[chosen]) - targets[chosen]).square().mean()
+                self.optimiser.step(loss)
+        return {"value_loss": float(loss.detach())}

@@ -1,0 +1,248 @@
+"""The run directory: artifacts, checkpoints, manifests. No other file knows how they lie on disk.
+
+An artifact is a folder that is finished if and only if its ``manifest.json`` exists. The folder is written under a
+temporary name, flushed to disk and renamed, so it is there as a whole or not at all; the manifest lists every file with
+its SHA-256, and reading checks it. Checkpoints are artifacts too, so they are protected in the same way.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+from numpy.typing import NDArray
+
+MANIFEST = "manifest.json"
+KEPT_CHECKPOINTS = 2
+
+Files = dict[str, bytes]
+"""Contents of an artifact by file name."""
+
+
+class DamagedArtifactError(RuntimeError):
+    """A file of a finished artifact is missing or does not have the bytes that its manifest names."""
+
+
+def encode_arrays(arrays: dict[str, NDArray]) -> bytes:
+    """Return a safetensors file with the given arrays."""
+    # Not ascontiguousarray, which turns a scalar into an array of one.
+    return safetensors.numpy.save({name: np.asarray(value, order="C") for name, value in arrays.items()})
+
+
+def encode_json(value: Any) -> bytes:
+    """Return readable JSON with sorted keys; numbers that are not finite become null."""
+    return (json.dumps(_finite(value), indent=2, sort_keys=True, allow_nan=False) + "\n").encode()
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+def fingerprint(value: Any) -> str:
+    """Return the SHA-256 of a JSON value in canonical form."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """A finished folder and what its manifest says."""
+
+    path: Path
+    fingerprint: str
+    """Names what it was made from."""
+    origin: dict[str, Any]
+    """The settings and inputs behind the fingerprint, readable, so that a difference can be named."""
+    versions: dict[str, str]
+    """Of the libraries that made it."""
+    hashes: dict[str, str]
+    """SHA-256 of each file."""
+
+    @property
+    def sha256(self) -> str:
+        """One hash over the hashes of all files: equal content, equal hash."""
+        return fingerprint(self.hashes)
+
+    def read(self, name: str) -> bytes:
+        """Return the bytes of a file. Raises DamagedArtifactError unless they are those that were written."""
+        path = self.path / name
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise DamagedArtifactError(f"{path}: {error.strerror}") from error
+        if hashlib.sha256(content).hexdigest() != self.hashes.get(name):
+            raise DamagedArtifactError(f"{path}: the content does not have the SHA-256 of the manifest")
+        return content
+
+    def arrays(self, name: str) -> dict[str, NDArray]:
+        """Return the arrays of a safetensors file, checked."""
+        return safetensors.numpy.load(self.read(name))
+
+    def json(self, name: str) -> Any:
+        """Return the value of a JSON file, checked."""
+        return json.loads(self.read(name))
+
+    def verify(self) -> None:
+        """Read every file. Raises DamagedArtifactError for the first that is not as written."""
+        for name in self.hashes:
+            self.read(name)
+
+
+def write_artifact(
+    path: Path, origin: dict[str, Any], files: Files, versions: dict[str, str] | None = None
+) -> Artifact:
+    """Write a finished artifact at ``path`` atomically, replacing any other there.
+
+    Raises OSError when the disk does not take it; whatever stood at ``path`` then stands as before.
+    """
+    hashes = {name: hashlib.sha256(content).hexdigest() for name, content in sorted(files.items())}
+    manifest = {"fingerprint": fingerprint(origin), "origin": origin, "versions": versions or {}, "files": hashes}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.parent / f".{path.name}.new"
+    replaced = path.parent / f".{path.name}.old"
+    try:
+        _remove(temporary)
+        temporary.mkdir()
+        for name, content in (*files.items(), (MANIFEST, encode_json(manifest))):
+            with open(temporary / name, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        _sync_folder(temporary)
+        _remove(replaced)
+        if path.exists():
+            path.rename(replaced)
+        temporary.rename(path)
+        _sync_folder(path.parent)
+    finally:
+        _remove(temporary)
+    _remove(replaced)
+    written = read_artifact(path)
+    assert written is not None
+    return written
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Replace one file atomically; for files of a run that are no artifact."""
+    temporary = path.with_name(f".{path.name}.new")
+    with open(temporary, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def read_artifact(path: Path) -> Artifact | None:
+    """Return the artifact at ``path``, or None unless it is finished. Raises DamagedArtifactError for a bad manifest."""
+    if not (path / MANIFEST).is_file():
+        return None
+    try:
+        manifest = json.loads((path / MANIFEST).read_bytes())
+        return Artifact(path, manifest["fingerprint"], manifest["origin"], manifest["versions"], manifest["files"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DamagedArtifactError(f"{path / MANIFEST}: not a manifest ({error})") from error
+
+
+def remove_artifact(path: Path) -> None:
+    """Delete an artifact; its manifest goes first, so that half a deletion is no artifact."""
+    (path / MANIFEST).unlink(missing_ok=True)
+    _remove(path)
+
+
+def _remove(path: Path) -> None:
+    if path.exists():
+        shutil.rmtree(path)
+
+
+def _sync_folder(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class Checkpoints:
+    """The newest states of one job, in a folder of its own; the last two are kept."""
+
+    def __init__(self, folder: Path, origin: dict[str, Any]) -> None:
+        self.folder = folder
+        self.origin = origin
+
+    def save(self, step: int, arrays: dict[str, NDArray]) -> None:
+        """Write a checkpoint and drop the oldest."""
+        write_artifact(self.folder / f"{step:09d}", self.origin, {"state.safetensors": encode_arrays(arrays)})
+        for old in self._paths()[:-KEPT_CHECKPOINTS]:
+            remove_artifact(old)
+
+    def load(self) -> tuple[dict[str, NDArray] | None, list[str]]:
+        """Return the newest sound state of a job with this origin, or None, and a warning for each damaged one."""
+        warnings = []
+        for path in reversed(self._paths()):
+            try:
+                checkpoint = read_artifact(path)
+                if checkpoint is not None and checkpoint.fingerprint == fingerprint(self.origin):
+                    return checkpoint.arrays("state.safetensors"), warnings
+            except (DamagedArtifactError, safetensors.SafetensorError) as error:
+                warnings.append(f"checkpoint ignored: {error}")
+        return None, warnings
+
+    def exist(self) -> bool:
+        """Return whether there is anything to resume from."""
+        return bool(self._paths())
+
+    def clear(self) -> None:
+        """Delete all checkpoints: the job is finished."""
+        _remove(self.folder)
+
+    def _paths(self) -> list[Path]:
+        return sorted(p for p in self.folder.glob("[0-9]*") if p.is_dir()) if self.folder.exists() else []
+
+
+@dataclass(frozen=True)
+class RunDirectory:
+    """Where everything of one run lies."""
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        """The resolved configuration."""
+        return self.path / "config.json"
+
+    @property
+    def report(self) -> Path:
+        """The report, one self-contained HTML file."""
+        return self.path / "report.html"
+
+    @property
+    def events(self) -> Path:
+        """What happened when: one JSON object per line. Times and worker counts belong here, not into artifacts."""
+        return self.path / "events.jsonl"
+
+    def logs(self) -> Path:
+        """Standard output and error of child processes, one file each."""
+        return self.path / "logs"
+
+    def stage(self, stage: str) -> Path:
+        """The artifact of a stage."""
+        return self.path / "stages" / stage
+
+    def job(self, stage: str, job: str) -> Path:
+        """The artifact of a job; a stage with one job of its own name has no other artifact."""
+        return self.stage(stage) if job == stage else self.path / "jobs" / stage / job
+
+    def checkpoints(self, stage: str, job: str) -> Path:
+        """The checkpoints of a job."""
+        return self.path / "checkpoints" / stage / job

@@ -1,0 +1,398 @@
+"""The configuration: one YAML file, one frozen model, validated once, written into the run directory.
+
+Every field has a type, a default where one is sensible, and a line below it. Unknown keys are errors that name the
+nearest valid key. Nothing here imports torch or a simulator.
+"""
+
+import difflib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
+
+UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
+Hidden = Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names the key, the value and what is allowed."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class EnvironmentConfig(_Section):
+    id: str = "oodil/Hopper-v0"
+    """A Gymnasium id that has a batched form."""
+    dynamics: dict[str, float] = {}
+    """Keyword arguments of the environment: the imitator's own dynamics."""
+
+
+class TrpoConfig(_Section):
+    """Trust region policy optimisation; the official constants."""
+
+    kind: Literal["trpo"] = "trpo"
+    max_kl: PositiveFloat = 0.01
+    """Size of the trust region, in nats per state."""
+    damping: PositiveFloat = 0.1
+    """Multiple of the identity added to the Fisher matrix."""
+    cg_iterations: PositiveInt = 10
+    """Conjugate gradient iterations per step."""
+    cg_tolerance: PositiveFloat = 1e-10
+    """Squared residual at which they stop."""
+    backtracks: PositiveInt = 10
+    """Halvings of the step before it is refused."""
+    accept_ratio: UnitInterval = 0.1
+    """Share of the expected improvement that a step must reach."""
+
+
+class PpoConfig(_Section):
+    """Proximal policy optimisation with the clipped surrogate."""
+
+    kind: Literal["ppo"] = "ppo"
+    learning_rate: PositiveFloat = 3e-4
+    """Adam's step size."""
+    epochs: PositiveInt = 5
+    """Passes over each batch."""
+    minibatch_size: PositiveInt = 512
+    """Transitions per gradient step."""
+    clip: PositiveFloat = 0.2
+    """Half-width of the ratio's interval."""
+    max_grad_norm: PositiveFloat = 0.5
+    """Gradients are scaled down to this norm."""
+    entropy_bonus: float = 0.0
+    """Weight of the policy's entropy."""
+    anneal: bool = True
+    """Let the step size fall linearly to zero over the training."""
+
+
+class ValueConfig(_Section):
+    hidden: Hidden = (64, 64)
+    """Widths of the hidden layers."""
+    learning_rate: PositiveFloat = 3e-4
+    """Adam's step size."""
+    epochs: PositiveInt = 1
+    """Passes over each batch."""
+    minibatch_size: PositiveInt = 86
+    """Transitions per gradient step; the official code cuts each batch into 30."""
+
+
+class DiscriminatorConfig(_Section):
+    hidden: Hidden = (64, 64)
+    """Widths of the hidden layers."""
+    learning_rate: PositiveFloat = 1e-3
+    """Adam's step size."""
+    steps_per_iteration: PositiveInt = 1
+    """Full-batch steps after each policy update."""
+
+
+class TrainingConfig(_Section):
+    """On-policy training: what is collected per iteration and how the policy learns from it."""
+
+    total_steps: PositiveInt
+    """Environment steps; rounded up to whole iterations."""
+    num_groups: PositiveInt = 4
+    """Env groups, the units of work handed to rollout workers; at most that many workers are busy at once."""
+    simulators_per_group: PositiveInt = 8
+    """Simulators stepped together in one group."""
+    steps_per_rollout: PositiveInt = 80
+    """Steps of each simulator per iteration."""
+    lag: Literal[0, 1] = 1
+    """Policy versions between collection and update; 1 lets workers collect while the learner updates."""
+    discount: UnitInterval = 0.995
+    """Discount per step."""
+    gae_lambda: UnitInterval = 0.97
+    """Decay of generalised advantage estimation."""
+    policy_hidden: Hidden = (64, 64)
+    """Widths of the policy's hidden layers."""
+    normalise_observations: bool = False
+    """Standardise what policy and value see, by running statistics; the discriminator always sees raw states."""
+    scale_rewards: bool = False
+    """Multiply rewards by 1 - discount, so that values are of order one."""
+    initial_log_std: float = 0.0
+    """Logarithm of the policy's initial standard deviation."""
+    generator: Annotated[TrpoConfig | PpoConfig, Field(discriminator="kind")] = TrpoConfig()
+    """How the policy is improved."""
+    value: ValueConfig = ValueConfig()
+    """The value function."""
+    num_evaluations: int = Field(12, ge=0)
+    """Points of the learning curve; each is the deterministic policy on fresh episodes. Never used for learning."""
+    evaluation_episodes: PositiveInt = 8
+    """Episodes per point of the curve."""
+    torch_threads: PositiveInt = 1
+    """Threads of the learner; more do not help networks of this size, and change the bits."""
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps per iteration."""
+        return self.num_groups * self.simulators_per_group * self.steps_per_rollout
+
+    @property
+    def num_iterations(self) -> int:
+        """Iterations that reach ``total_steps``."""
+        return -(-self.total_steps // self.steps_per_iteration)
+
+
+class GailConfig(TrainingConfig):
+    """Adversarial imitation: training whose reward comes from a discriminator."""
+
+    discriminator: DiscriminatorConfig = DiscriminatorConfig()
+    """What tells demonstrations from the policy."""
+
+
+class SourceConfig(_Section):
+    """One demonstrator: its dynamics, its expert and how many of its demonstrations are used."""
+
+    label: str
+    """Its name in reports."""
+    dynamics: dict[str, float] = {}
+    """Keyword arguments of the environment: the demonstrator's own dynamics."""
+    expert: Path
+    """Folder of a saved expert, relative to the configuration file."""
+    expert_discount: UnitInterval = 0.995
+    """Discount with which its expert is trained; flights are long under low gravity and want a longer horizon."""
+    count: PositiveInt
+    """Demonstrations to collect."""
+    transferable: bool | None = None
+    """Whether the imitator can reproduce it, if known: for the report and the oracle, never an input of the method."""
+
+
+class DemonstrationsConfig(_Section):
+    """Where the demonstrations come from: a file, or saved experts."""
+
+    file: Path | None = None
+    """A saved set, relative to the configuration file."""
+    sources: tuple[SourceConfig, ...] = ()
+    """Demonstrators to collect from."""
+    deterministic: bool = False
+    """Collect with mean actions instead of sampled ones."""
+    full_length_only: bool = True
+    """Keep only episodes that last to the time limit, as the paper does."""
+
+    @model_validator(mode="after")
+    def _one_origin(self) -> "DemonstrationsConfig":
+        if (self.file is None) == (not self.sources):
+            raise ValueError("give either file or sources")
+        labels = [source.label for source in self.sources]
+        if len(set(labels)) != len(labels):
+            raise ValueError(f"two sources have the same label: {labels}")
+        return self
+
+
+class ClusteringConfig(_Section):
+    """Contrastive clustering, Algorithm 1; the defaults are the appendix's."""
+
+    num_clusters: PositiveInt = 5
+    """K at initialisation; clusters may end up empty. With 1 the encoder is skipped."""
+    subtrajectory_length: int = Field(20, ge=2)
+    """States per sub-trajectory."""
+    sampling: Literal["fixed_length", "fixed_stride"] = "fixed_length"
+    """Whether ``subtrajectory_length`` counts states (appendix) or is the stride between them (official code)."""
+    hidden: PositiveInt = 128
+    """Width of the LSTM, and of the embedding."""
+    temperature: PositiveFloat = 1.0
+    """Divides the cosine similarities."""
+    centre_weight: float = Field(0.01, ge=0.0)
+    """Lambda: weight of the distance to the centres."""
+    reduction: Literal["sum", "mean"] = "sum"
+    """How that distance is reduced over the 2B sub-trajectories of a batch."""
+    learning_rate: PositiveFloat = 0.01
+    """Adam's step size."""
+    weight_decay: float = Field(0.0, ge=0.0)
+    """Adam's weight decay."""
+    warmup_iterations: int = Field(200, ge=0)
+    """Iterations with the contrastive loss alone."""
+    joint_iterations: int = Field(2000, ge=0)
+    """Iterations with both losses."""
+    batch_size: PositiveInt = 128
+    """Demonstrations per iteration; all of them if there are fewer."""
+    initial_centres: Literal["trajectories", "kmeans"] = "trajectories"
+    """K random demonstrations (appendix) or k-means of all (official code)."""
+    initial_count: PositiveInt = 100
+    """Counter at which each centre's running mean starts."""
+    update_order: Literal["step_first", "centres_first"] = "step_first"
+    """Gradient step, re-assign, then centres (appendix), or centres before the step (official code)."""
+    normalise_centres: bool = True
+    """Keep centres on the unit sphere."""
+    standardise_states: bool = True
+    """Standardise each state dimension over the set."""
+    label_draws: PositiveInt = 5
+    """Sub-trajectories whose features are averaged for the final label."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _preset(cls, values: Any) -> Any:
+        if isinstance(values, dict) and values.get("preset") == "official":
+            return OFFICIAL_CLUSTERING | {key: value for key, value in values.items() if key != "preset"}
+        return values
+
+
+OFFICIAL_CLUSTERING: dict[str, Any] = {
+    "sampling": "fixed_stride",
+    "learning_rate": 1e-3,
+    "weight_decay": 1e-6,
+    "joint_iterations": 1800,
+    "initial_centres": "kmeans",
+    "update_order": "centres_first",
+    "normalise_centres": False,
+    "standardise_states": False,
+    "label_draws": 1,
+}
+"""What ``clustering.preset: official`` stands for: the released code's reading of the method."""
+
+
+class TransferabilityConfig(_Section):
+    """One GAIL job per cluster, and how its discriminators are read."""
+
+    gail: GailConfig
+    """Training of each job."""
+    num_scores: int = Field(100, ge=2)
+    """Times the demonstrations are scored while a job runs, evenly spaced."""
+    averaged_scores: PositiveInt = 20
+    """How many of the last scores are averaged."""
+    sharpening: float = Field(1.0, gt=0.0)
+    """Power to which a transferability is raised to become a weight; 1 is the paper's plain form."""
+
+
+class ImitationConfig(_Section):
+    """The final policy."""
+
+    gail: GailConfig
+    """Training of the final policy, and of every baseline."""
+    final_episodes: PositiveInt = 32
+    """Deterministic episodes of the final evaluation."""
+
+
+Baseline = Literal["naive_gail", "oracle"]
+
+
+class RuntimeConfig(_Section):
+    """How it runs. Nothing here changes a result, so nothing here is part of a fingerprint."""
+
+    workers: int = Field(2, ge=0)
+    """Parallel processes; 0 runs everything in the orchestrator's own."""
+    checkpoint_interval_s: float = Field(20.0, ge=0.0)
+    """Seconds between checkpoints of a job; 0 checkpoints every iteration."""
+    unit_timeout_s: PositiveFloat = 30.0
+    """Seconds after which a unit of work is given to another rollout worker."""
+    max_attempts: PositiveInt = 3
+    """Starts of a job before it counts as failed."""
+    max_worker_restarts: PositiveInt = 20
+    """Restarts of rollout workers in one stage before it counts as failed."""
+    restart_delay_s: float = Field(0.5, ge=0.0)
+    """Pause before the first restart; it doubles with each further one, up to 10 s."""
+
+
+class RunConfig(_Section):
+    """One run: demonstrations, clusters, transferability, policy."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
+    """Name of the run and of its default folder."""
+    seed: int = Field(0, ge=0)
+    """Root of all randomness."""
+    environment: EnvironmentConfig
+    """The imitator's environment."""
+    demonstrations: DemonstrationsConfig
+    """What is imitated."""
+    clustering: ClusteringConfig = ClusteringConfig()
+    """Modes of the demonstrations."""
+    transferability: TransferabilityConfig
+    """What the imitator can reproduce."""
+    imitation: ImitationConfig
+    """The final policy."""
+    baselines: tuple[Baseline, ...] = ()
+    """What is trained beside it for comparison."""
+    runtime: RuntimeConfig = RuntimeConfig()
+    """How it runs."""
+
+    @model_validator(mode="after")
+    def _oracle_needs_labels(self) -> "RunConfig":
+        sources = self.demonstrations.sources
+        if "oracle" in self.baselines and not any(source.transferable for source in sources):
+            raise ValueError("baselines: the oracle needs sources that are marked transferable: true")
+        return self
+
+
+def load_config(path: Path, overrides: list[str] | None = None) -> RunConfig:
+    """Read a YAML file, apply ``key.sub=value`` overrides and validate.
+
+    Paths in the file are taken relative to it. Raises ConfigError with one line per problem.
+    """
+    try:
+        values = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid YAML: {error}") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: expected a mapping of keys, found {type(values).__name__}")
+    for override in overrides or []:
+        _override(values, override)
+    config = parse_config(values, origin=str(path))
+    return _resolve_paths(config, path.resolve().parent)
+
+
+def parse_config(values: dict[str, Any], origin: str) -> RunConfig:
+    """Validate plain values. Raises ConfigError that names ``origin``, the key, the value and the nearest valid key."""
+    try:
+        return RunConfig.model_validate(values)
+    except ValidationError as error:
+        problems = [_describe(problem) for problem in error.errors()]
+        raise ConfigError("\n".join(f"{origin}: {problem}" for problem in problems)) from None
+
+
+def _override(values: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    if not equals or not key:
+        raise ConfigError(f"override {override!r} is not of the form key=value")
+    *parents, last = key.split(".")
+    for parent in parents:
+        values = values.setdefault(parent, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"override {override!r}: {parent} is not a section")
+    values[last] = yaml.safe_load(text)
+
+
+def _describe(problem: Any) -> str:
+    location = [part for part in problem["loc"] if part not in ("trpo", "ppo")]
+    key = ".".join(str(part) for part in location)
+    if problem["type"] == "extra_forbidden":
+        known = _fields_at(location[:-1])
+        near = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
+        hint = f"; did you mean {near[0]!r}?" if near else f"; valid keys: {', '.join(known)}"
+        return f"unknown key {key!r}{hint}"
+    message = problem["msg"].removeprefix("Value error, ")
+    if problem["type"] == "missing":
+        return f"{key}: required, but missing"
+    return f"{key}: {message}, got {problem['input']!r}" if problem["type"] != "value_error" else f"{key}: {message}"
+
+
+def _fields_at(location: list[Any]) -> list[str]:
+    """Return the keys that are valid at a place of the configuration."""
+    models: list[Any] = [RunConfig]
+    for part in location:
+        if isinstance(part, int):
+            continue
+        models = [m for model in models if part in model.model_fields for m in _models(model.model_fields[part])]
+    return sorted({name for model in models for name in model.model_fields})
+
+
+def _models(field: Any) -> list[type[BaseModel]]:
+    found, pending = [], [field.annotation, *field.metadata]
+    while pending:
+        annotation = pending.pop()
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            found.append(annotation)
+        pending.extend(getattr(annotation, "__args__", ()))
+    return found
+
+
+def _resolve_paths(config: RunConfig, base: Path) -> RunConfig:
+    demonstrations = config.demonstrations
+    file = base / demonstrations.file if demonstrations.file else None
+    sources = tuple(s.model_copy(update={"expert": base / s.expert}) for s in demonstrations.sources)
+    return config.model_copy(
+        update={"demonstrations": demonstrations.model_copy(update={"file": file, "sources": sources})}
+    )

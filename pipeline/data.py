@@ -1,0 +1,90 @@
+"""What flows between the stages. Letters: N demonstrations, T states of one, S observation, K clusters.
+
+Shapes are checked where a value is made, so that no stage has to ask again.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class DataError(ValueError):
+    """Demonstrations that cannot be used; the message names the demonstration, the value and the limit."""
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """States of N demonstrations of unequal length, one after the other."""
+
+    observations: NDArray[np.float32]
+    """(sum T, S) states."""
+    offsets: NDArray[np.int64]
+    """(N + 1,) where each demonstration starts; the last entry is sum T."""
+    sources: NDArray[np.int32]
+    """(N,) index into ``source_labels``; for reporting only, never an input of the method."""
+    source_labels: tuple[str, ...]
+    """What each source is called."""
+    returns: NDArray[np.float64]
+    """(N,) true returns in the demonstrator's own environment, NaN where unknown; for reporting only."""
+
+    def __post_init__(self) -> None:
+        if self.observations.ndim != 2 or self.observations.dtype != np.float32 or not self.observations.shape[1]:
+            raise DataError(
+                f"observations are {self.observations.dtype}{self.observations.shape}; expected float32 (sum T, S)"
+            )
+        if self.offsets.ndim != 1 or len(self.offsets) < 2 or self.offsets[0] != 0:
+            raise DataError("offsets must be (N + 1,) integers that start at 0, with at least one demonstration")
+        if self.offsets[-1] != len(self.observations):
+            raise DataError(f"offsets end at {self.offsets[-1]} but there are {len(self.observations)} states")
+        short = np.flatnonzero(self.lengths < 2)
+        if short.size:
+            raise DataError(
+                f"demonstration {short[0]} has {self.lengths[short[0]]} state(s); a transition needs at least 2"
+            )
+        finite = np.isfinite(self.observations).all(axis=1)
+        if not finite.all():
+            row = int(np.flatnonzero(~finite)[0])
+            n = int(np.searchsorted(self.offsets, row, side="right")) - 1
+            value = self.observations[row][~np.isfinite(self.observations[row])][0]
+            raise DataError(f"demonstration {n} has the value {value} in state {row - self.offsets[n]}; must be finite")
+        if self.sources.shape != (len(self),) or self.returns.shape != (len(self),):
+            raise DataError(f"sources and returns must have one entry for each of the {len(self)} demonstrations")
+        if self.sources.min() < 0 or self.sources.max() >= len(self.source_labels):
+            raise DataError(f"source indices must lie in [0, {len(self.source_labels)})")
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def __getitem__(self, n: int) -> NDArray[np.float32]:
+        """Return the (T, S) states of demonstration ``n``."""
+        return self.observations[self.offsets[n] : self.offsets[n + 1]]
+
+    @property
+    def observation_dim(self) -> int:
+        """S."""
+        return int(self.observations.shape[1])
+
+    @property
+    def lengths(self) -> NDArray[np.int64]:
+        """(N,) states of each demonstration."""
+        return np.diff(self.offsets)
+
+    def transition_starts(self) -> NDArray[np.int64]:
+        """Return (M,) rows that have a successor in the same demonstration."""
+        last = np.zeros(len(self.observations), np.bool_)
+        last[self.offsets[1:] - 1] = True
+        return np.flatnonzero(~last)
+
+    def select(self, chosen: NDArray[np.int64]) -> "Demonstrations":
+        """Return the chosen demonstrations, in the given order."""
+        if not len(chosen):
+            raise DataError("no demonstration was selected")
+        parts = [self[int(n)] for n in chosen]
+        return Demonstrations(
+            observations=np.concatenate(parts),
+            offsets=np.cumsum([0, *(len(p) for p in parts)]).astype(np.int64),
+            sources=self.sources[chosen],
+            source_labels=self.source_labels,
+            returns=self.returns[chosen],
+        )

@@ -1,0 +1,5 @@
+"""Demonstrations on disk."""
+
+from pipeline.datasets.native import decode_demonstrations, encode_demonstrations, read_demonstrations
+
+__all__ = ["decode_demonstrations", "encode_demonstrations", "read_demonstrations"]

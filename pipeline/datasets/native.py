@@ -1,0 +1,62 @@
+"""The project's own file of demonstrations: safetensors, with a schema version and the labels in its header."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from pipeline.data import DataError, Demonstrations
+
+SCHEMA = "1"
+_DTYPES = {"observations": np.float32, "offsets": np.int64, "sources": np.int32, "returns": np.float64}
+
+
+def encode_demonstrations(demonstrations: Demonstrations, environment_id: str) -> bytes:
+    """Return the file's bytes."""
+    arrays = {name: np.ascontiguousarray(getattr(demonstrations, name)) for name in _DTYPES}
+    labels = json.dumps(list(demonstrations.source_labels))
+    return safetensors.numpy.save(
+        arrays, metadata={"schema": SCHEMA, "environment": environment_id, "source_labels": labels}
+    )
+
+
+def read_demonstrations(path: Path) -> tuple[Demonstrations, str]:
+    """Return the demonstrations of a file and the id of the environment they are from.
+
+    ``observations`` and ``offsets`` are required; without ``sources`` all are from one source. Raises DataError that
+    names the file and what is wrong with it.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror or error}") from error
+    return decode_demonstrations(content, str(path))
+
+
+def decode_demonstrations(content: bytes, origin: str) -> tuple[Demonstrations, str]:
+    """Return what `read_demonstrations` does, from bytes; ``origin`` is named in errors."""
+    try:
+        header_size = int.from_bytes(content[:8], "little")
+        metadata = json.loads(content[8 : 8 + header_size]).get("__metadata__", {})
+        arrays = safetensors.numpy.load(content)
+        labels = json.loads(metadata.get("source_labels", '["demonstrations"]'))
+    except (safetensors.SafetensorError, ValueError, AttributeError) as error:
+        raise DataError(f"{origin}: not a sound safetensors file, truncated perhaps ({error})") from error
+    if metadata.get("schema", SCHEMA) != SCHEMA:
+        raise DataError(f"{origin}: schema {metadata['schema']}; this version reads schema {SCHEMA}")
+    for name in ("observations", "offsets"):
+        if name not in arrays:
+            raise DataError(f"{origin}: has no array {name!r}")
+    count = max(len(arrays["offsets"]) - 1, 0)
+    arrays.setdefault("sources", np.zeros(count, np.int32))
+    arrays.setdefault("returns", np.full(count, np.nan))
+    for name, dtype in _DTYPES.items():
+        if arrays[name].dtype != dtype:
+            raise DataError(f"{origin}: array {name!r} is {arrays[name].dtype}; expected {np.dtype(dtype)}")
+    try:
+        demonstrations = Demonstrations(source_labels=tuple(labels), **{name: arrays[name] for name in _DTYPES})
+    except DataError as error:
+        raise DataError(f"{origin}: {error}") from error
+    return demonstrations, str(metadata.get("environment", ""))

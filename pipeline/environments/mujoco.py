@@ -1,0 +1,97 @@
+"""Gymnasium's v5 locomotion tasks with their dynamics as keyword arguments.
+
+The observation is ``[qpos, qvel]`` with root x, as the paper's experiments use it (docs/environments.md). Dynamics are
+set on the compiled model, so no XML is copied. Each class also states its health rule and its reset noise for a whole
+batch of simulators at once; `pipeline.environments.batch` steps them and is tested to agree with these classes to the bit.
+"""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco import half_cheetah_v5, hopper_v5, walker2d_v5
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class HopperEnv(hopper_v5.HopperEnv):
+    """Hopper-v5 with root x in the observation and a chosen ``gravity`` in m/s^2 (positive, downwards)."""
+
+    velocity_limit = 10.0
+
+    def __init__(self, gravity: float = 9.81, **kwargs: Any) -> None:
+        if not 0 < gravity < np.inf:
+            raise ValueError(f"gravity is {gravity}; it must be positive and finite (m/s^2, downwards)")
+        super().__init__(exclude_current_positions_from_observation=False, **kwargs)
+        self.model.opt.gravity[2] = -gravity
+
+    def batch_healthy(self, qpos: Floats, qvel: Floats) -> NDArray[np.bool_]:
+        """Return (G,) health for states ``qpos`` (G, 6) and ``qvel`` (G, 6), by the rule of Hopper-v5."""
+        low, high = self._healthy_state_range
+        z, angle = qpos[:, 1], qpos[:, 2]
+        inside = ((low < qpos[:, 2:]) & (qpos[:, 2:] < high)).all(1) & ((low < qvel) & (qvel < high)).all(1)
+        return (
+            inside
+            & (self._healthy_z_range[0] < z)
+            & (z < self._healthy_z_range[1])
+            & (self._healthy_angle_range[0] < angle)
+            & (angle < self._healthy_angle_range[1])
+        )
+
+    def reset_velocity(self, rng: np.random.Generator) -> Floats:
+        """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
+        scale = self._reset_noise_scale
+        return self.init_qvel + rng.uniform(low=-scale, high=scale, size=self.model.nv)
+
+
+class Walker2dEnv(walker2d_v5.Walker2dEnv):
+    """Walker2d-v5 with root x in the observation and one sliding ``friction`` for both feet.
+
+    MuJoCo takes the larger friction of the two geoms in contact; the floor's is 0.7, so smaller values act as 0.7.
+    """
+
+    velocity_limit = 10.0
+    reset_velocity = HopperEnv.reset_velocity
+
+    def __init__(self, friction: float = 1.9, **kwargs: Any) -> None:
+        if not 0 < friction < np.inf:
+            raise ValueError(f"friction is {friction}; it must be positive and finite")
+        super().__init__(exclude_current_positions_from_observation=False, **kwargs)
+        for foot in ("foot_geom", "foot_left_geom"):
+            self.model.geom(foot).friction[0] = friction
+
+    def batch_healthy(self, qpos: Floats, qvel: Floats) -> NDArray[np.bool_]:
+        """Return (G,) health for states ``qpos`` (G, 9) and ``qvel`` (G, 9), by the rule of Walker2d-v5."""
+        z, angle = qpos[:, 1], qpos[:, 2]
+        return (
+            (self._healthy_z_range[0] < z)
+            & (z < self._healthy_z_range[1])
+            & (self._healthy_angle_range[0] < angle)
+            & (angle < self._healthy_angle_range[1])
+        )
+
+
+class HalfCheetahEnv(half_cheetah_v5.HalfCheetahEnv):
+    """HalfCheetah-v5 with root x in the observation and the motors of the front and back leg scaled.
+
+    ``front`` and ``back`` multiply the gears of the three motors of each leg; 1 is the unmodified robot.
+    """
+
+    velocity_limit = np.inf
+
+    def __init__(self, front: float = 1.0, back: float = 1.0, **kwargs: Any) -> None:
+        if not (0 <= front < np.inf and 0 <= back < np.inf):
+            raise ValueError(f"front and back are {front} and {back}; a motor's scale must be finite and not negative")
+        super().__init__(exclude_current_positions_from_observation=False, **kwargs)
+        for actuator in range(self.model.nu):
+            name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator)
+            self.model.actuator_gear[actuator, 0] *= front if name.startswith("f") else back
+
+    def batch_healthy(self, qpos: Floats, qvel: Floats) -> None:
+        """HalfCheetah never ends an episode and pays nothing for survival."""
+        return None
+
+    def reset_velocity(self, rng: np.random.Generator) -> Floats:
+        """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
+        return self.init_qvel + self._reset_noise_scale * rng.standard_normal(self.model.nv)

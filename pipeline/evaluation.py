@@ -1,0 +1,100 @@
+"""Evaluation on the true return, which nothing ever learns from. Letters: E episodes, T states, S observation."""
+
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.environments import MujocoBatch, make_batch
+from pipeline.policy import GaussianPolicy
+from pipeline.seeding import Key, generator
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """True returns and lengths of E episodes."""
+
+    returns: NDArray[np.float64]
+    """(E,)"""
+    lengths: NDArray[np.int64]
+    """(E,) steps."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode from reset to end."""
+
+    states: NDArray[np.float32]
+    """(T, S), the first and the last state included."""
+    env_return: float
+    """Sum of the environment's own reward."""
+
+
+def run_episodes(
+    simulators: MujocoBatch, policy: GaussianPolicy, rng: np.random.Generator, *, stochastic: bool
+) -> list[Episode]:
+    """Run one fresh episode in every simulator side by side."""
+    count = simulators.num_simulators
+    for g in range(count):
+        simulators.reset(g, seed=int(rng.integers(2**31)))
+    trace = [simulators.observations().astype(np.float32)]
+    returns, lengths = np.zeros(count), np.zeros(count, np.int64)
+    std = np.exp(policy.log_std)
+    while not lengths.all():
+        actions = policy.mean(simulators.observations())
+        if stochastic:
+            actions = actions + std * rng.standard_normal(actions.shape, dtype=np.float32)
+        outcome = simulators.step(actions)
+        trace.append(simulators.observations().astype(np.float32))
+        ended = (outcome.terminated | outcome.truncated) & (lengths == 0)
+        lengths[ended] = simulators.elapsed_steps()[ended]
+        returns[ended] = simulators.episode_returns()[ended]
+    states = np.stack(trace)
+    return [Episode(states[: lengths[g] + 1, g], float(returns[g])) for g in range(count)]
+
+
+def evaluate(
+    policy: GaussianPolicy,
+    env_id: str,
+    dynamics: Mapping[str, float],
+    episodes: int,
+    key: Key,
+    *,
+    stochastic: bool = False,
+) -> Evaluation:
+    """Run ``episodes`` fresh episodes, with mean actions unless ``stochastic``."""
+    seen = run_episodes(make_batch(env_id, dynamics, episodes), policy, generator(key), stochastic=stochastic)
+    return Evaluation(np.array([e.env_return for e in seen]), np.array([len(e.states) - 1 for e in seen]))
+
+
+def film(policy: GaussianPolicy, env_id: str, dynamics: Mapping[str, float], seed: int, path: Path) -> float:
+    """Film one deterministic episode as MP4 and return its true return.
+
+    Raises OSError when nothing can be rendered here, with what is missing.
+    """
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    import imageio.v2 as imageio
+
+    try:
+        env = gymnasium.make(env_id, render_mode="rgb_array", **dynamics)
+        observation, _ = env.reset(seed=seed)
+        with imageio.get_writer(path, fps=env.metadata["render_fps"] // 4, macro_block_size=None) as video:
+            env_return, ended, step = 0.0, False, 0
+            while not ended:
+                if step % 4 == 0:
+                    video.append_data(env.render())
+                observation, reward, terminated, truncated, _ = env.step(policy.mean(observation[None])[0])
+                env_return, ended, step = env_return + float(reward), terminated or truncated, step + 1
+        env.close()
+    except (ImportError, RuntimeError, AttributeError, gymnasium.error.Error) as error:
+        raise OSError(
+            f"cannot render here ({error}); a machine without a display needs EGL or OSMesa "
+            "(Debian: apt-get install libegl1 or libosmesa6, then MUJOCO_GL=egl or MUJOCO_GL=osmesa)"
+        ) from error
+    return env_return

@@ -1,0 +1,113 @@
+"""Experts: policies trained on the true reward of a demonstrator's dynamics, and the demonstrations they give.
+
+This is the only place where the environment's reward is learned from. A saved expert is an artifact folder with the
+policy and, beside it, what it reaches.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.algorithms.learner import EnvReward, Learner
+from pipeline.artifacts import Artifact, Checkpoints, Files, encode_arrays, encode_json, read_artifact
+from pipeline.config import EnvironmentConfig, PpoConfig, TrainingConfig, ValueConfig
+from pipeline.data import DataError, Demonstrations
+from pipeline.environments import make_batch
+from pipeline.evaluation import Episode, run_episodes
+from pipeline.policy import GaussianPolicy
+from pipeline.seeding import derive_key, generator
+from pipeline.stage import JobContext
+from pipeline.training import train
+
+EXPERT_TRAINING = TrainingConfig(
+    total_steps=2_500_000,
+    num_groups=4,
+    simulators_per_group=16,
+    steps_per_rollout=64,
+    lag=0,
+    discount=0.995,
+    gae_lambda=0.97,
+    normalise_observations=True,
+    scale_rewards=True,
+    generator=PpoConfig(learning_rate=1e-3, epochs=5, minibatch_size=512),
+    value=ValueConfig(learning_rate=1e-3, epochs=5, minibatch_size=512),
+    num_evaluations=0,
+)
+"""What an expert is trained with unless its source says otherwise."""
+
+COLLECTION_SIMULATORS = 16
+"""Episodes collected side by side; part of what the demonstrations depend on."""
+
+
+class ExpertError(ValueError):
+    """An expert that is missing, damaged, or does not fit; the message names its folder."""
+
+
+def train_expert(
+    environment: EnvironmentConfig, config: TrainingConfig, seed: int, context: JobContext, checkpoints: Checkpoints
+) -> GaussianPolicy:
+    """Train one expert on the environment's reward."""
+    simulators = make_batch(environment.id, environment.dynamics, 1)
+    learner = Learner(simulators.observation_dim, simulators.action_dim, config, EnvReward(), seed)
+    train(learner, environment, config, [], context, checkpoints)
+    return learner.behaviour_policy()
+
+
+def expert_files(policy: GaussianPolicy, description: dict[str, Any]) -> Files:
+    """Return the files of a saved expert; ``description`` says for what it was trained and what it reaches."""
+    return {"policy.safetensors": encode_arrays(policy.arrays()), "expert.json": encode_json(description)}
+
+
+def load_expert(path: Path) -> tuple[GaussianPolicy, Artifact]:
+    """Return a saved expert's policy and its artifact. Raises ExpertError unless it is there and sound."""
+    try:
+        artifact = read_artifact(path)
+        if artifact is None:
+            raise ExpertError(f"{path}: no expert is saved here")
+        return GaussianPolicy.from_arrays(artifact.arrays("policy.safetensors")), artifact
+    except (RuntimeError, ValueError) as error:
+        raise ExpertError(str(error)) from error
+
+
+def collect_demonstrations(
+    policy: GaussianPolicy,
+    environment: EnvironmentConfig,
+    label: str,
+    count: int,
+    seed: int,
+    *,
+    deterministic: bool,
+    full_length_only: bool,
+    context: JobContext,
+) -> tuple[Demonstrations, float]:
+    """Collect ``count`` demonstrations and return them with the share of episodes that were kept.
+
+    Raises DataError when fewer than one episode in ten can be kept.
+    """
+    simulators = make_batch(environment.id, environment.dynamics, COLLECTION_SIMULATORS)
+    kept: list[Episode] = []
+    rounds = 0
+    while len(kept) < count:
+        rounds += 1
+        key = derive_key(seed, "demonstrations", label, rounds)
+        episodes = run_episodes(simulators, policy, generator(key), stochastic=not deterministic)
+        full = simulators.max_episode_steps + 1
+        kept += [episode for episode in episodes if not full_length_only or len(episode.states) == full]
+        if len(kept) * 10 < rounds * COLLECTION_SIMULATORS:
+            raise DataError(
+                f"source {label!r}: only {len(kept)} of {rounds * COLLECTION_SIMULATORS} episodes last the full "
+                f"{simulators.max_episode_steps} steps; train a better expert or set full_length_only: false"
+            )
+        context.progress(min(len(kept), count), count)
+    share = len(kept) / (rounds * COLLECTION_SIMULATORS)
+    states = [episode.states for episode in kept[:count]]
+    demonstrations = Demonstrations(
+        observations=np.concatenate(states),
+        offsets=np.cumsum([0, *(len(s) for s in states)]).astype(np.int64),
+        sources=np.zeros(count, np.int32),
+        source_labels=(label,),
+        returns=np.array([episode.env_return for episode in kept[:count]]),
+    )
+    return demonstrations, share
+

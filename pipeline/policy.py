@@ -1,0 +1,64 @@
+"""The policy that travels: a Gaussian whose mean is a small tanh network, evaluated with NumPy alone.
+
+Rollout workers need nothing but this file and a simulator, so they start fast and stay small. The network that is
+trained lives in `pipeline.algorithms.networks`; a test holds the two together.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class GaussianPolicy:
+    """Action = mean(observation) + exp(log_std) * noise. Letters: G simulators, S observation, A action, H hidden."""
+
+    weights: tuple[Array, ...]
+    """Layer matrices (inputs, outputs), tanh between them."""
+    biases: tuple[Array, ...]
+    log_std: Array
+    """(A,), independent of the observation."""
+    input_mean: Array
+    """(S,) subtracted from the observation."""
+    input_scale: Array
+    """(S,) multiplied afterwards."""
+
+    def mean(self, observations: NDArray[np.float64]) -> Array:
+        """Return (G, A) mean actions, which are also the deterministic ones, for (G, S) observations."""
+        hidden = (observations.astype(np.float32) - self.input_mean) * self.input_scale
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            hidden = np.tanh(hidden @ weight + bias)
+        return np.asarray(hidden @ self.weights[-1] + self.biases[-1])
+
+    def log_prob_of_noise(self, noise: Array) -> Array:
+        """Return (...) log-densities of the actions that the standard normal ``noise`` (..., A) gives."""
+        constant = np.float32(0.5 * np.log(2 * np.pi) * noise.shape[-1]) + self.log_std.sum()
+        return np.asarray(-0.5 * np.square(noise).sum(axis=-1) - constant)
+
+    def arrays(self) -> dict[str, Array]:
+        """Return the parameters by name, for messages and files; `from_arrays` is the inverse."""
+        named = {"log_std": self.log_std, "input_mean": self.input_mean, "input_scale": self.input_scale}
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            named[f"weight_{i}"], named[f"bias_{i}"] = weight, bias
+        return named
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Array]) -> "GaussianPolicy":
+        """Rebuild a policy from `arrays`. Raises ValueError when a name is missing or shapes do not chain."""
+        depth = sum(name.startswith("weight_") for name in arrays)
+        try:
+            weights = tuple(arrays[f"weight_{i}"] for i in range(depth))
+            biases = tuple(arrays[f"bias_{i}"] for i in range(depth))
+            policy = cls(weights, biases, arrays["log_std"], arrays["input_mean"], arrays["input_scale"])
+        except KeyError as error:
+            raise ValueError(f"policy has no array {error.args[0]!r}") from None
+        widths = [len(policy.input_mean), *(len(bias) for bias in biases)]
+        for i, weight in enumerate(weights):
+            if weight.shape != (widths[i], widths[i + 1]):
+                raise ValueError(f"policy layer {i} has shape {weight.shape}; expected {(widths[i], widths[i + 1])}")
+        if not weights or policy.log_std.shape != (widths[-1],) or policy.input_scale.shape != (widths[0],):
+            raise ValueError("policy arrays do not fit together")
+        return policy

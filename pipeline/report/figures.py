@@ -1,0 +1,318 @@
+"""The figures of the report, each as one SVG element. They hold no text of the user, so the page brings the legends.
+
+Letters: N demonstrations, K clusters, E embedding, M points of a curve. Sources keep one colour and one marker throughout:
+blues can be reproduced by the imitator, oranges cannot, so the eye sees at once whether the two were told apart. The
+two families differ in blue against yellow, which every common form of colour blindness leaves intact.
+"""
+
+import io
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+from numpy.typing import NDArray
+from sklearn.decomposition import PCA
+from sklearn.manifold import TSNE
+from threadpoolctl import threadpool_limits
+
+INK, MUTED, GRID = "#1c2430", "#6a7383", "#e6e9ee"
+
+TRANSFERABLE = ("#1f5fa8", "#45b0d8", "#12837a", "#8aa9e8", "#123a63")
+NOT_TRANSFERABLE = ("#cf4f1b", "#f2a63b", "#8c3310", "#ec8577", "#b58a12")
+UNKNOWN = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#4b5563", "#b3a400")
+CLUSTERS = ("#2f7d4f", "#8458b3", "#a8b545", "#c25a9d", "#4b3b73", "#7cc79a", "#8c929c", "#c9a2e0", "#20463a", "#7a5c3e")
+MARKERS = (("o", "●"), ("s", "■"), ("^", "▲"), ("D", "◆"), ("v", "▼"), ("P", "✚"))
+"""Markers of Matplotlib and the characters that stand for them in a legend."""
+
+FEWEST_FOR_TSNE, MOST_FOR_TSNE = 30, 4000
+PERPLEXITY = 8.0
+"""Below the size of the smallest sources that matter: the paper's rarest have ten demonstrations, and the usual 30
+shrinks them to a dot."""
+MOST_AS_VECTORS = 3000
+"""Above this, dots are drawn as a picture inside the SVG, which would otherwise take megabytes."""
+
+STYLE: dict[str, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.5,
+    "text.color": INK,
+    "text.parse_math": False,
+    "axes.edgecolor": "#b9c0ca",
+    "axes.labelcolor": MUTED,
+    "axes.labelpad": 7,
+    "axes.titlesize": 9,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.8,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "axes.axisbelow": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.8,
+    "xtick.color": "#b9c0ca",
+    "ytick.color": "#b9c0ca",
+    "xtick.labelcolor": MUTED,
+    "ytick.labelcolor": MUTED,
+    "xtick.major.size": 3,
+    "ytick.major.size": 0,
+    "lines.solid_capstyle": "round",
+    "figure.facecolor": "none",
+    "svg.fonttype": "none",
+}
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a source is drawn in every figure and legend."""
+
+    colour: str
+    marker: str
+    glyph: str
+
+    @property
+    def text(self) -> str:
+        """The colour of text on this colour."""
+        red, green, blue = (int(self.colour[i : i + 2], 16) for i in (1, 3, 5))
+        return "#fff" if 0.299 * red + 0.587 * green + 0.114 * blue < 140 else INK
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A learning curve: (M,) environment steps, mean returns and their standard deviations over episodes."""
+
+    name: str
+    env_steps: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    std: NDArray[np.float64]
+
+
+def source_looks(transferable: Iterable[bool | None]) -> list[Look]:
+    """Return one look per source; a marker changes when the colours of its family are used up."""
+    transferable = list(transferable)
+    families = {True: TRANSFERABLE, False: NOT_TRANSFERABLE, None: UNKNOWN}
+    if set(transferable) != {None}:
+        families[None] = ("#7c5fa8", "#6b7280", "#b49bd4", "#3f3a5c")
+    used = {True: 0, False: 0, None: 0}
+    looks = []
+    for known in transferable:
+        family = families[known]
+        marker, glyph = MARKERS[used[known] // len(family) % len(MARKERS)]
+        looks.append(Look(family[used[known] % len(family)], marker, glyph))
+        used[known] += 1
+    return looks
+
+
+def project(features: NDArray[np.float32]) -> tuple[NDArray[np.float64], str] | None:
+    """Return (N, 2) points for (N, E) features and the name of the projection; None when there is nothing to see."""
+    if len(features) < 3 or features.size == 0 or not np.isfinite(features).all() or np.ptp(features, axis=0).max() == 0:
+        return None
+    features = features.astype(np.float64)
+    # One thread: sums over several would differ in their last bits from run to run, and t-SNE would magnify them.
+    with threadpool_limits(1):
+        if FEWEST_FOR_TSNE <= len(features) <= MOST_FOR_TSNE:
+            tsne = TSNE(perplexity=PERPLEXITY, init="pca", learning_rate="auto", random_state=0)
+            return tsne.fit_transform(features).astype(np.float64), "t-SNE"
+        components = PCA(min(2, features.shape[1]), svd_solver="full").fit_transform(features)
+    return np.pad(components, ((0, 0), (0, 2 - components.shape[1]))), "PCA"
+
+
+def embedding(
+    points: NDArray[np.float64], clusters: NDArray[np.int32], sources: NDArray[np.int32], looks: list[Look]
+) -> str:
+    """Draw (N, 2) points twice: by cluster (N,), each marked with its number, and by source (N,)."""
+    size = float(np.clip(6000 / len(points), 7, 60))
+    with _drawing("embedding", 11, 5.0) as (figure, svg):
+        left, right = figure.subplots(1, 2, gridspec_kw={"wspace": 0.03})
+        for axes, title in ((left, "by cluster"), (right, "by source")):
+            axes.set_title(title)
+            axes.set(xticks=[], yticks=[])
+            axes.spines[:].set_visible(False)
+            axes.set_facecolor("#f7f8fa")
+            axes.margins(0.06, 0.1)
+        for k in np.unique(clusters):
+            member = points[clusters == k]
+            _dots(left, member, CLUSTERS[k % len(CLUSTERS)], "o", size, len(points))
+        for k in np.unique(clusters):
+            member = points[clusters == k]
+            x, y = np.median(member[:, 0]), np.quantile(member[:, 1], 0.9)
+            box = {"boxstyle": "round,pad=0.3", "facecolor": "white", "edgecolor": CLUSTERS[k % len(CLUSTERS)]}
+            left.annotate(
+                str(k), (x, y), xytext=(0, 13), textcoords="offset points", ha="center", va="center",
+                fontsize=8, fontweight="bold", bbox=box, zorder=5,
+            )  # fmt: skip
+        for i in _largest_first(sources):
+            _dots(right, points[sources == i], looks[i].colour, looks[i].marker, size, len(points))
+    return svg.getvalue()
+
+
+def transferability(scores: NDArray[np.float64], sources: NDArray[np.int32], looks: list[Look]) -> str:
+    """Draw the (N,) scores from the highest to the lowest, coloured by source (N,); beside it, one column per source."""
+    order = np.argsort(-scores, kind="stable")
+    rank = np.empty(len(scores))
+    rank[order] = np.arange(1, len(scores) + 1)
+    with _drawing("transferability", 11, 3.3) as (figure, svg):
+        several = len(looks) > 1
+        panels = figure.subplots(1, 1 + several, sharey=True, squeeze=False, width_ratios=(3, 1)[: 1 + several])[0]
+        axes = panels[0]
+        width = min(0.6 * 11 * 72 * 0.8 / len(scores), 9.0)
+        size = float(np.clip(5000 / len(scores), 9, 48))
+        for i in _largest_first(sources):
+            mine = sources == i
+            stems = axes.vlines(rank[mine], 0, scores[mine], color=looks[i].colour, linewidth=width, alpha=0.30)
+            stems.set_capstyle("butt")
+            stems.set_rasterized(len(scores) > MOST_AS_VECTORS)
+            points = np.stack([rank[mine], scores[mine]], axis=1)
+            _dots(axes, points, looks[i].colour, looks[i].marker, size, len(scores))
+        axes.set_xlim(0.5 - 0.008 * len(scores), len(scores) * 1.008 + 0.5)
+        _score_axis(axes, float(scores.max()))
+        ticks = [tick for tick in MaxNLocator(8, integer=True).tick_values(1, len(scores)) if 1 < tick <= len(scores)]
+        axes.set_xticks([1, *ticks])
+        axes.set_xlabel("demonstrations, from the most to the least transferable")
+        axes.set_ylabel("transferability")
+        if several:
+            _columns(panels[1], scores, sources, looks, size)
+    return svg.getvalue()
+
+
+def _columns(
+    axes: Axes, scores: NDArray[np.float64], sources: NDArray[np.int32], looks: list[Look], size: float
+) -> None:
+    """Draw one column of dots per source, in the legend's order, with a line at its mean."""
+    axes.set(xticks=[], xlim=(-0.6, len(looks) - 0.4))
+    axes.set_xlabel("by source, line at the mean")
+    for i, look in enumerate(looks):
+        mine = scores[sources == i]
+        if not len(mine):
+            continue
+        spread = (np.arange(len(mine)) * 0.618034) % 1.0 - 0.5  # evenly spread whatever their number, and always alike
+        x = i + 0.6 * spread * min(1.0, len(mine) / 30)
+        _dots(axes, np.stack([x, mine], axis=1), look.colour, look.marker, 0.7 * size, len(scores))
+        axes.hlines(mine.mean(), i - 0.42, i + 0.42, color=INK, linewidth=1.6, zorder=4)
+
+
+def convergence(
+    histories: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]], colours: dict[int, str]
+) -> str:
+    """Draw one panel per cluster: (M,) environment steps and (M, N_k) scores, as mean and 10 to 90 % band."""
+    columns = min(len(histories), 5)
+    rows = -(-len(histories) // columns)
+    highest = max(float(scores.max()) for _, scores in histories.values())
+    with _drawing("convergence", 11, 0.75 + 1.75 * rows) as (figure, svg):
+        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False, gridspec_kw={"wspace": 0.07})
+        for axes in panels.flat[len(histories) :]:
+            axes.set_visible(False)
+        for axes in panels.flat[: len(histories)][-columns:]:
+            axes.tick_params(labelbottom=True)
+        for axes, (k, (env_steps, scores)) in zip(panels.flat, histories.items(), strict=False):
+            low, high = np.quantile(scores, (0.1, 0.9), axis=1)
+            axes.fill_between(env_steps, low, high, color=colours[k], alpha=0.22, linewidth=0)
+            axes.plot(env_steps, scores.mean(axis=1), color=colours[k], linewidth=1.8)
+            axes.set_title(f"cluster {k}", fontweight="bold")
+            axes.set_title(f"N = {scores.shape[1]}", loc="right", fontsize=7.5, color=MUTED)
+            _score_axis(axes, highest, note=False)
+            _steps_axis(axes, 3)
+        figure.supxlabel("environment steps of the cluster's job", fontsize=8.5, color=MUTED)
+        panels[0, 0].set_ylabel("transferability")
+    return svg.getvalue()
+
+
+def learning(ours: Curve | None, naive: Curve | None, oracle_return: float | None) -> str:
+    """Draw true returns over environment steps, with a band of one standard deviation over episodes."""
+    with _drawing("learning", 11, 3.7) as (figure, svg):
+        axes = figure.subplots()
+        ends: list[tuple[float, str, str]] = []
+        for curve, colour, width in ((naive, "#98a0ad", 1.8), (ours, INK, 2.4)):
+            if curve is None:
+                continue
+            low, high = curve.mean - curve.std, curve.mean + curve.std
+            axes.fill_between(curve.env_steps, low, high, color=colour, alpha=0.16, linewidth=0)
+            axes.plot(curve.env_steps, curve.mean, color=colour, linewidth=width, marker="o", markersize=3.2)
+            ends.append((float(curve.mean[-1]), curve.name, colour))
+        if oracle_return is not None:
+            axes.axhline(oracle_return, color=TRANSFERABLE[0], linewidth=1.4, linestyle=(0, (5, 3)))
+            ends.append((oracle_return, "oracle", TRANSFERABLE[0]))
+        axes.set_xlim(0, max((float(c.env_steps[-1]) for c in (ours, naive) if c is not None), default=1.0) * 1.01)
+        axes.set_ylim(bottom=min(0, axes.get_ylim()[0]))
+        _name_lines(axes, ends)
+        _steps_axis(axes, 8)
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}" if abs(value) >= 10 else f"{value:g}"))
+        axes.set_xlabel("environment steps")
+        axes.set_ylabel("return")
+    return svg.getvalue()
+
+
+def _name_lines(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
+    """Write names to the right of the lines' ends, pushed apart where they would touch."""
+    low, high = axes.get_ylim()
+    apart = 0.065 * (high - low)
+    placed = -np.inf
+    for value, name, colour in sorted(ends):
+        placed = max(value, placed + apart)
+        axes.annotate(
+            name, (1.0, placed), xytext=(8, 0), xycoords=("axes fraction", "data"), textcoords="offset points",
+            color=colour, va="center", fontweight="bold", annotation_clip=False,
+        )  # fmt: skip
+
+
+def _largest_first(sources: NDArray[np.int32]) -> list[int]:
+    """Return the sources so that the rare ones are drawn last, on top."""
+    present, counts = np.unique(sources, return_counts=True)
+    return [int(i) for i in present[np.argsort(-counts, kind="stable")]]
+
+
+def _dots(axes: Axes, points: NDArray[np.float64], colour: str, marker: str, size: float, total: int) -> None:
+    axes.scatter(
+        points[:, 0], points[:, 1], s=size, c=colour, marker=marker, linewidths=0.35, edgecolors="white", zorder=3,
+        rasterized=total > MOST_AS_VECTORS,
+    )  # fmt: skip
+
+
+def _score_axis(axes: Axes, highest: float, note: bool = True) -> None:
+    axes.set_ylim(0, max(0.56, min(1.0, highest * 1.06)))
+    axes.axhline(0.5, color=MUTED, linewidth=0.8, linestyle=(0, (2, 3)), zorder=1)
+    if note:
+        axes.text(
+            1.0, 0.5, "0.5: not to be told from the imitator's own experience", transform=axes.get_yaxis_transform(),
+            ha="right", va="bottom", fontsize=7.5, color=MUTED,
+        )  # fmt: skip
+
+
+def _steps_axis(axes: Axes, bins: int) -> None:
+    axes.xaxis.set_major_locator(MaxNLocator(bins, steps=[1, 2, 5, 10]))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: count(value)))
+
+
+def count(value: float) -> str:
+    """Return a number of steps in a few characters, such as 2.5 M."""
+    for unit, name in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if abs(value) >= unit:
+            return f"{value / unit:.3g}{name}"
+    return f"{value:.0f}"
+
+
+@contextmanager
+def _drawing(name: str, width: float, height: float) -> Iterator[tuple[Figure, io.StringIO]]:
+    """Open a figure in the report's style; on leaving, its SVG element stands in the text that came with it.
+
+    Equal content gives equal bytes: identifiers are salted with the figure's name, and no date is written.
+    """
+    with matplotlib.style.context(["default", STYLE | {"svg.hashsalt": name}]):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasSVG(figure)
+        svg = io.StringIO()
+        yield figure, svg
+        drawn = io.StringIO()
+        figure.savefig(drawn, format="svg", dpi=200, metadata={"Date": None})
+    element = drawn.getvalue()
+    element = re.sub(r"<metadata>.*?</metadata>", "", element[element.index("<svg") :], flags=re.DOTALL)
+    # Group identifiers (axes_1, ...) recur in every figure and nothing refers to them.
+    svg.write(re.sub(r'(<g) id="[^"]*"', r"\1", element).strip())

@@ -1,0 +1,488 @@
+"""The page around the figures: what was run, what came out, and what a reader has to know before quoting it."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from pipeline.report import figures
+from pipeline.report.figures import Curve, Look
+from pipeline.report.style import CSS
+from pipeline.results import STAGES, Results
+from pipeline.stage import Run
+
+FEW_EPISODES = 20
+"""Below this a mean return is called rough."""
+UNSTABLE_LABELS = 0.9
+"""Below this share of labels that survive another draw, clusters are called unstable."""
+
+TITLES = {
+    "demonstrations": "demonstrations",
+    "clustering": "clustering",
+    "transferability": "transferability",
+    "imitation": "imitation",
+    "naive_gail": "naive GAIL",
+    "oracle": "oracle",
+}
+
+
+QUALITY = (
+    ("silhouette", "silhouette", 3),
+    ("calinski_harabasz", "Calinski-Harabasz", 1),
+    ("label_stability", "label stability", 3),
+    ("purity", "purity", 3),
+)
+"""Key, name and digits of what is said about the clusters."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A demonstrator as the report shows it."""
+
+    label: str
+    transferable: bool | None
+    count: int
+    look: Look
+
+
+@dataclass(frozen=True)
+class Collection:
+    """The demonstrations as the report needs them: whose they are and how many transitions each has."""
+
+    sources: list[Source]
+    source_of: NDArray[np.int32]
+    """(N,) index into ``sources``."""
+    transitions: NDArray[np.int64]
+    """(N,)"""
+    own_returns: list[float | None]
+    """Mean return of each source in its own environment."""
+
+    @property
+    def looks(self) -> list[Look]:
+        """One per source."""
+        return [source.look for source in self.sources]
+
+    @property
+    def labelled(self) -> bool:
+        """Whether it is known whose the demonstrations are."""
+        return len(self.sources) > 1 or self.sources[0].transferable is not None
+
+    def shares(self, mass: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return each source's share of a mass (N,)."""
+        return np.bincount(self.source_of, mass, minlength=len(self.sources)) / mass.sum()
+
+
+def render(run: Run) -> str:
+    """Return the HTML of the report for everything that is finished."""
+    results = Results(run)
+    collection = _collection(results)
+    body = [
+        _learning_section(results),
+        _transferability_section(results, collection),
+        _clustering_section(results, collection),
+        _provenance_section(results),
+    ]
+    head = [_headline(results, collection), _cards(results), _notes(results, collection)]
+    title = escape(run.config.name)
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{title}</title>\n<style>{CSS}</style>\n</head>\n<body>\n<main>\n"
+        + "\n".join([*head, *body])
+        + "\n</main>\n</body>\n</html>\n"
+    )
+
+
+def _collection(results: Results) -> Collection | None:
+    arrays = results.arrays("demonstrations", "demonstrations.safetensors")
+    if not arrays:
+        return None
+    described = results.json("demonstrations", "demonstrations.json")
+    transitions = np.diff(arrays["offsets"]) - 1
+    labels = described.get("source_labels") or ["all demonstrations"]
+    source_of = arrays["sources"] if described.get("source_labels") else np.zeros(len(transitions), np.int32)
+    transferable = described.get("transferable") or [None] * len(labels)
+    counts = np.bincount(source_of, minlength=len(labels))
+    looks = figures.source_looks(transferable)
+    sources = [
+        Source(str(label) or "unnamed", known, int(number), look)
+        for label, known, number, look in zip(labels, transferable, counts, looks, strict=True)
+    ]
+    means = [float(np.mean(arrays["returns"][source_of == i])) if counts[i] else np.nan for i in range(len(labels))]
+    return Collection(sources, source_of, transitions, [mean if np.isfinite(mean) else None for mean in means])
+
+
+# -- the top of the page -------------------------------------------------------------------------------------------
+
+
+def _headline(results: Results, collection: Collection | None) -> str:
+    config = results.run.config
+    dynamics = ", ".join(f"{name} {value:g}" for name, value in config.environment.dynamics.items())
+    imitator = f"<b>{escape(config.environment.id)}</b> with {escape(dynamics or 'its own, unchanged dynamics')}"
+    if collection is None:
+        lead = f"Imitator: {imitator}."
+    else:
+        number = _plural(len(collection.transitions), "demonstration")
+        known = collection.labelled
+        lead = f"Imitator: {imitator}. It learns from {number} of {_plural(len(collection.sources), 'source')}"
+        lead += "." if known else ", of which nothing more is known."
+    finding = _finding(results)
+    return (
+        f'<header>\n<p class="kicker">Imitation from demonstrators with other dynamics</p>\n'
+        f'<h1>{escape(config.name)}</h1>\n<p class="lead">{lead}</p>\n'
+        + (_legend(collection.sources, counts=True) + _families(collection) if collection and collection.labelled else "")
+        + (f'<p class="finding">{finding}</p>\n' if finding else "")
+        + "</header>"
+    )
+
+
+def _families(collection: Collection) -> str:
+    """Say what the colours mean."""
+    meanings = {True: "Blue: known to be transferable to the imitator.", False: "Orange: known not to be."}
+    told = [meaning for known, meaning in meanings.items() if any(s.transferable is known for s in collection.sources)]
+    return _caption(" ".join(told)) if told else ""
+
+
+def _finding(results: Results) -> str:
+    ours, naive, oracle = (_final(results, stage).get("final_return") for stage in ("imitation", "naive_gail", "oracle"))
+    if ours is None:
+        return ""
+    text = f"The policy learned from weighted demonstrations returns <b>{_return(ours)}</b>"
+    if naive is not None:
+        comparable = ours > 0 and naive > 0
+        text += f", {ours / naive:.1f} times" if comparable else ", against"
+        text += f" the {_return(naive)} of naive GAIL" if comparable else f" {_return(naive)} of naive GAIL"
+    if oracle is not None:
+        share = f"; the oracle, which is told what is transferable, reaches {_return(oracle)}"
+        text += share
+    return text + "."
+
+
+def _final(results: Results, stage: str) -> dict[str, Any]:
+    return results.json(stage, "evaluation.json")
+
+
+def _cards(results: Results) -> str:
+    scores = results.json("transferability", "summary.json")
+    diagnostics = results.json("clustering", "diagnostics.json")
+    seconds, env_steps = results.seconds(), results.env_steps()
+    cards = []
+    for stage, name in (("imitation", "ours"), ("naive_gail", "naive GAIL"), ("oracle", "oracle")):
+        final = _final(results, stage)
+        asked = stage in results.artifacts or stage in results.problems
+        cards.append(_card(f"Final return, {name}", _return(final.get("final_return")), _spread(final) if asked else "not asked for"))
+    before, after = scores.get("transferable_share_before"), scores.get("transferable_share")
+    share = f'{_percent(before)}<span class="arrow">→</span>{_percent(after)}' if after is not None else None
+    cards.append(_card("Transferable share", share, "of what the policy learns from, before and after weighting"))
+    cards.append(_card("AUROC", _number(scores.get("auroc"), 3), "1 if all transferable demonstrations rank above all others"))
+    cards.append(_card("Purity of clusters", _number(diagnostics.get("purity"), 3), _cluster_note(diagnostics)))
+    cards.append(_card("Environment steps", figures.count(sum(env_steps.values())) if env_steps else None, "in all trainings"))
+    cards.append(_card("Time", _duration(sum(seconds.values())) if seconds else None, "of all finished stages"))
+    return f'<dl class="cards">\n{"".join(cards)}</dl>'
+
+
+def _spread(final: dict[str, Any]) -> str:
+    spread, episodes = final.get("final_return_std"), final.get("episodes")
+    if spread is None or episodes is None:
+        return ""
+    digits = f"{spread:,.0f}" if abs(final.get("final_return") or 0) >= 100 else f"{spread:.2g}"
+    return f"± {digits} over {_plural(episodes, 'episode')}"
+
+
+def _cluster_note(diagnostics: dict[str, Any]) -> str:
+    if not diagnostics:
+        return ""
+    return f"{diagnostics.get('non_empty_clusters')} of {diagnostics.get('num_clusters')} clusters in use"
+
+
+def _card(title: str, figure: str | None, note: str) -> str:
+    shown = f'<div class="figure">{figure}</div>' if figure is not None else '<div class="figure unknown">–</div>'
+    return f'<div class="card"><dt>{title}</dt><dd>{shown}<div class="note">{note}</div></dd></div>\n'
+
+
+def _notes(results: Results, collection: Collection | None) -> str:
+    """Say what limits the figures on this page."""
+    stages_with: dict[str, list[str]] = {}
+    for stage, problem in results.problems.items():
+        stages_with.setdefault(problem, []).append(TITLES[stage])
+    notes = [f"<b>Missing: {', '.join(stages)}</b>, {escape(problem)}." for problem, stages in stages_with.items()]
+    finals = {stage: _final(results, stage) for stage in ("imitation", "naive_gail", "oracle")}
+    trained = {stage: final for stage, final in finals.items() if final}
+    if trained:
+        seed = results.run.config.seed
+        notes.append(f"One seed ({seed}). Returns of adversarial imitation vary a lot from seed to seed; a comparison needs "
+                     "five or more. The spreads on this page are between episodes, not between seeds.")  # fmt: skip
+    few = {TITLES[stage]: final["episodes"] for stage, final in trained.items() if final.get("episodes", 99) < FEW_EPISODES}
+    if few:
+        named = ", ".join(f"{title} {number}" for title, number in few.items())
+        notes.append(f"Few evaluation episodes ({named}): the mean returns are rough.")
+    steps = {stage: final.get("env_steps") for stage, final in trained.items()}
+    if len(set(steps.values())) > 1:
+        named = ", ".join(f"{TITLES[stage]} {figures.count(value or 0)}" for stage, value in steps.items())
+        notes.append(f"The final policies were not trained for equally long ({named} environment steps).")
+    if collection and any(source.transferable is None for source in collection.sources):
+        notes.append("Not all sources are known to be transferable or not; AUROC and shares cover only what is known.")
+    stability = results.json("clustering", "diagnostics.json").get("label_stability")
+    if stability is not None and stability < UNSTABLE_LABELS:
+        notes.append(f"Clusters are unstable: only {_percent(stability)} of the demonstrations keep their cluster when other "
+                     "parts of them are drawn.")  # fmt: skip
+    if not notes:
+        return ""
+    items = "".join(f"<li>{note}</li>\n" for note in notes)
+    return f'<aside class="notes">\n<h3>Before you quote these figures</h3>\n<ul>\n{items}</ul>\n</aside>'
+
+
+# -- sections ------------------------------------------------------------------------------------------------------
+
+
+def _learning_section(results: Results) -> str:
+    ours, naive = (_curve(results, stage) for stage in ("imitation", "naive_gail"))
+    oracle = _final(results, "oracle").get("final_return")
+    if ours is None and naive is None:
+        return _section("The policy", _missing("No policy has been trained yet."))
+    episodes = results.run.config.imitation.gail.evaluation_episodes
+    caption = (
+        f"True return of the deterministic policy in the imitator's environment, {_plural(episodes, 'episode')} at each point; "
+        "the bands are one standard deviation of the episodes. The return is never used for learning. "
+    )
+    if oracle is not None:
+        caption += "Dashed: the final return of the oracle, which imitates only what is known to be transferable."
+    return _section("The policy", _figure(figures.learning(ours, naive, oracle), "Learning curves") + _caption(caption))
+
+
+def _curve(results: Results, stage: str) -> Curve | None:
+    found = results.json(stage, "curve.json")
+    if not found.get("env_steps"):
+        return None
+    values = (np.array(found[key], np.float64) for key in ("env_steps", "return_mean", "return_std"))
+    return Curve({"imitation": "ours"}.get(stage, TITLES[stage]), *values)
+
+
+def _transferability_section(results: Results, collection: Collection | None) -> str:
+    arrays = results.arrays("transferability", "transferability.safetensors")
+    if collection is None or not arrays:
+        return _section("Transferability", _missing("The transferability of the demonstrations is not known yet."))
+    summary = results.json("transferability", "summary.json")
+    before = collection.transitions.astype(np.float64)
+    after = arrays["weights"] * collection.transitions
+    sharpening = summary.get("sharpening")
+    parts = [
+        _caption(
+            "Each mark is one demonstration: how far the discriminator of its cluster's job takes it for something that the "
+            "imitator itself does. A demonstration is drawn for imitation in proportion to "
+            + ("this value." if sharpening in (None, 1) else f"this value to the power {sharpening:g}.")
+        ),
+        _legend(collection.sources),
+        _figure(
+            figures.transferability(arrays["scores"], collection.source_of, collection.looks),
+            "Transferability of every demonstration, sorted",
+        ),
+        "<h3>What the policy learns from</h3>",
+        _mass_bars(collection, before, after),
+        _source_table(collection, summary.get("mean_score_by_source") or {}, before, after),
+        _convergence(results, collection),
+    ]
+    return _section("Transferability", "\n".join(parts))
+
+
+def _mass_bars(collection: Collection, before: NDArray[np.float64], after: NDArray[np.float64]) -> str:
+    rows = ""
+    for title, mass in (("unweighted", before), ("weighted", after)):
+        segments = "".join(
+            f'<span style="flex:{share:.5f};background:{source.look.colour};color:{source.look.text}" title="{escape(source.label)}: {_percent(share)}">'
+            f"{_percent(share) if share >= 0.05 else ''}</span>"
+            for source, share in zip(collection.sources, collection.shares(mass), strict=True)
+        )
+        rows += f'<div>{title}</div><div class="bar">{segments}</div>\n'
+    return f'<div class="mass">\n{rows}</div>'
+
+
+def _source_table(
+    collection: Collection, mean_scores: dict[str, Any], before: NDArray[np.float64], after: NDArray[np.float64]
+) -> str:
+    rows = ""
+    columns = zip(collection.sources, collection.own_returns, collection.shares(before), collection.shares(after), strict=True)
+    for source, own_return, share_before, share_after in columns:
+        known = {True: "yes", False: "no", None: "not known"}[source.transferable]
+        cells = (
+            str(source.count), _return(own_return) or "–", _number(mean_scores.get(source.label), 3) or "–",
+            _percent(share_before), _percent(share_after),
+        )  # fmt: skip
+        numbers = "".join(f'<td class="number">{cell}</td>' for cell in cells)
+        rows += f"<tr><th>{_name(source)}</th><td>{known}</td>{numbers}</tr>\n"
+    titles = ("demonstrations", "return in its own dynamics", "mean transferability", "share before", "share after")
+    head = "<th>source</th><th>transferable</th>" + "".join(f'<th class="number">{title}</th>' for title in titles)
+    return f'<div class="scroll"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}</tbody>\n</table></div>'
+
+
+def _convergence(results: Results, collection: Collection) -> str:
+    history = results.arrays("transferability", "history.safetensors")
+    clusters = sorted(int(name.split("/")[0].removeprefix("cluster_")) for name in history if name.endswith("/scores"))
+    if not clusters:
+        return ""
+    histories, colours = {}, {}
+    for k in clusters:
+        histories[k] = (history[f"cluster_{k}/env_steps"].astype(np.float64), history[f"cluster_{k}/scores"])
+        members = collection.source_of[history[f"cluster_{k}/demonstrations"]]
+        colours[k] = collection.looks[int(np.bincount(members).argmax())].colour
+    caption = (
+        "Scores while the job of each cluster ran: mean and the range of the middle 80 % of its demonstrations, in the "
+        "colour of its most frequent source. A curve that still moves at its end asks for a longer job."
+    )
+    drawn = _figure(figures.convergence(histories, colours), "Scores of each cluster over environment steps")
+    return f"<h3>Did the scores settle?</h3>\n{_caption(caption)}\n{drawn}"
+
+
+def _clustering_section(results: Results, collection: Collection | None) -> str:
+    arrays = results.arrays("clustering", "assignment.safetensors")
+    if collection is None or not arrays:
+        return _section("Clusters", _missing("The demonstrations have not been clustered yet."))
+    diagnostics = results.json("clustering", "diagnostics.json")
+    projected = figures.project(arrays["features"])
+    if projected is None:
+        drawn = _missing("There is no embedding to show: the demonstrations were not told apart, or are too few.")
+    else:
+        points, projection = projected
+        drawn = _caption(
+            f"The embedding of the demonstrations, brought to two dimensions by {projection}"
+            + (", in which only neighbourhoods mean something, not distances." if projection == "t-SNE" else ".")
+            + " The method sees no sources; they are shown to judge it."
+        )
+        drawn += _legend(collection.sources)
+        svg = figures.embedding(points, arrays["labels"], collection.source_of, collection.looks)
+        drawn += _figure(svg, "Embedding of the demonstrations, by cluster and by source")
+    named = [
+        f"{title} {_number(diagnostics[key], digits)}"
+        for key, title, digits in QUALITY
+        if diagnostics.get(key) is not None
+    ]
+    listed = _caption(f"Quality: {', '.join(named)}.") if named else ""
+    return _section("Clusters", f"{drawn}\n{_contingency(results, collection, diagnostics)}\n{listed}")
+
+
+def _contingency(results: Results, collection: Collection, diagnostics: dict[str, Any]) -> str:
+    contingency: dict[str, list[int]] = diagnostics.get("contingency") or {}
+    if not contingency:
+        return ""
+    used = [k for k in range(len(next(iter(contingency.values())))) if any(counts[k] for counts in contingency.values())]
+    rows = ""
+    for source in collection.sources:
+        counts = contingency.get(source.label, [0] * (max(used) + 1))
+        total = max(sum(counts), 1)
+        cells = "".join(_heat(counts[k], counts[k] / total) for k in used)
+        rows += f"<tr><th>{_name(source)}</th>{cells}</tr>\n"
+    scores = results.arrays("transferability", "transferability.safetensors")
+    if scores:
+        means = [scores["scores"][scores["clusters"] == k] for k in used]
+        cells = "".join(f"<td>{mean.mean():.3f}</td>" if len(mean) else "<td>–</td>" for mean in means)
+        rows += f'<tr class="mean"><th>mean transferability</th>{cells}</tr>\n'
+    head = "<th>cluster</th>" + "".join(f"<th>{k}</th>" for k in used)
+    return (
+        "<h3>Which source went into which cluster</h3>\n"
+        f'<div class="scroll"><table class="heat">\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}</tbody>\n</table></div>'
+    )
+
+
+def _heat(count: int, share: float) -> str:
+    colour = "#fff" if share > 0.55 else "inherit" if count else "#b9c0ca"
+    return f'<td style="background:rgba(47,72,110,{0.05 + 0.85 * share:.3f});color:{colour}">{count}</td>'
+
+
+def _provenance_section(results: Results) -> str:
+    run = results.run
+    seconds, env_steps = results.seconds(), results.env_steps()
+    rows = ""
+    for stage in STAGES:
+        artifact = results.artifacts.get(stage)
+        if artifact is None and stage not in results.problems:
+            continue
+        time = _duration(seconds[stage]) if stage in seconds else "–"
+        steps = f"{env_steps[stage]:,}" if stage in env_steps else "–"
+        made = f"<code>{artifact.sha256}</code>" if artifact else escape(results.problems[stage])
+        rows += (
+            f'<tr><th>{TITLES[stage]}</th><td class="number">{time}</td><td class="number">{steps}</td><td>{made}</td></tr>\n'
+        )
+    head = '<th>stage</th><th class="number">time</th><th class="number">environment steps</th><th>SHA-256 of the artifact</th>'
+    stages = f'<div class="scroll"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}</tbody>\n</table></div>'
+    config = yaml.safe_dump(run.config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    parts = [
+        f"<p>Root seed {run.config.seed}; every random stream is derived from it.</p>",
+        stages,
+        _versions(results),
+        f"<details><summary>Resolved configuration</summary><pre>{escape(config)}</pre></details>",
+    ]
+    return _section("What was run", "\n".join(parts))
+
+
+def _versions(results: Results) -> str:
+    """List library versions, and name the stages where one differs from another."""
+    found: dict[str, dict[str, list[str]]] = {}
+    for stage, artifact in results.artifacts.items():
+        for library, version in artifact.versions.items():
+            found.setdefault(library, {}).setdefault(version, []).append(TITLES[stage])
+    listed = []
+    for library, versions in sorted(found.items()):
+        each = [version if len(versions) == 1 else f"{version} ({', '.join(used)})" for version, used in versions.items()]
+        listed.append(f"{escape(library)} {escape(' and '.join(each))}")
+    return f"<p>Made with {', '.join(listed)}.</p>" if listed else ""
+
+
+# -- pieces --------------------------------------------------------------------------------------------------------
+
+
+def _section(title: str, content: str) -> str:
+    return f"<section>\n<h2>{title}</h2>\n{content}\n</section>"
+
+
+def _figure(svg: str, description: str) -> str:
+    accessible = svg.replace("<svg", f'<svg role="img" aria-label="{description}"', 1)
+    return f"<figure>{accessible}</figure>"
+
+
+def _caption(text: str) -> str:
+    return f'<p class="caption">{text}</p>'
+
+
+def _missing(text: str) -> str:
+    return f'<p class="missing">{text}</p>'
+
+
+def _legend(sources: Iterable[Source], counts: bool = False) -> str:
+    items = "".join(f"<li>{_name(source)}{f' ({source.count})' if counts else ''}</li>" for source in sources)
+    return f'<ul class="legend">{items}</ul>\n'
+
+
+def _name(source: Source) -> str:
+    return f'<span class="swatch" style="color:{source.look.colour}">{source.look.glyph}</span>{escape(source.label)}'
+
+
+def _plural(number: int, noun: str) -> str:
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def _return(value: float | None) -> str | None:
+    if value is None:
+        return None
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def _number(value: float | None, digits: int) -> str | None:
+    return None if value is None else f"{value:.{digits}f}"
+
+
+def _percent(share: float | None) -> str:
+    if share is None:
+        return "–"
+    return f"{100 * share:.1f} %" if share < 0.0995 or share > 0.9905 else f"{100 * share:.0f} %"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes_left = divmod(minutes, 60)
+    return f"{hours} h {minutes_left:02d} min" if hours else f"{minutes} min {rest:02d} s"

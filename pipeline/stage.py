@@ -1,0 +1,117 @@
+"""The contract of a stage, and what a running job sees of the runtime.
+
+A stage is a name, a version, its inputs and one or more independent jobs. It never starts a process or opens a socket:
+an engine (`workers.engine`) decides where its jobs run and who collects their rollouts.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from pipeline.artifacts import Artifact, Checkpoints, Files, RunDirectory, fingerprint, read_artifact
+from pipeline.config import RunConfig
+from pipeline.rollout import Unit, UnitResult
+
+
+class JobStoppedError(Exception):
+    """A job stopped because it was asked to, after writing a checkpoint."""
+
+
+class RolloutSource(Protocol):
+    """Who collects: the job's own process, rollout workers behind a socket, or a cluster. All give the same bits."""
+
+    def submit(self, units: list[Unit]) -> None:
+        """Hand over the units of one iteration; collection may begin at once."""
+
+    def gather(self) -> list[UnitResult]:
+        """Wait for the submitted units and return their results in group order."""
+
+
+class JobContext(Protocol):
+    """What a job may ask of the process it runs in."""
+
+    rollouts: RolloutSource
+    checkpoint_interval_s: float
+
+    def progress(self, done: int, total: int, **metrics: float) -> None:
+        """Report ``done`` of ``total`` environment steps (or iterations) and current figures; cheap to call often."""
+
+    def warn(self, message: str) -> None:
+        """Say something the user should see."""
+
+    def should_stop(self) -> bool:
+        """Return whether the job should checkpoint and raise JobStoppedError."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A configuration and where its results lie; read-only for stages."""
+
+    config: RunConfig
+    directory: RunDirectory
+
+    def artifact(self, stage: str) -> Artifact:
+        """Return the finished artifact of an earlier stage. Raises LookupError if it is not finished."""
+        return _finished(read_artifact(self.directory.stage(stage)), stage)
+
+    def job_artifact(self, stage: str, job: str) -> Artifact:
+        """Return the finished artifact of a job of the same stage. Raises LookupError if it is not finished."""
+        return _finished(read_artifact(self.directory.job(stage, job)), f"{stage}/{job}")
+
+
+def _finished(artifact: Artifact | None, name: str) -> Artifact:
+    if artifact is None:
+        raise LookupError(f"{name} is not finished")
+    return artifact
+
+
+class Stage(ABC):
+    """One step of the pipeline."""
+
+    name: str
+    version: int
+    """Raise it when the meaning of the code changes, so that old artifacts are not reused."""
+    inputs: tuple[str, ...]
+    """Stages whose artifacts it reads."""
+    distributed: bool = False
+    """Whether rollout workers collect for its job; otherwise a job collects in its own process."""
+
+    @abstractmethod
+    def settings(self, config: RunConfig) -> dict[str, Any]:
+        """Return everything in the configuration that changes the result, as JSON values."""
+
+    def jobs(self, run: Run) -> list[str]:
+        """Return the names of its independent jobs; one named as the stage by default."""
+        return [self.name]
+
+    @abstractmethod
+    def run_job(self, run: Run, job: str, context: JobContext) -> Files:
+        """Compute a job and return its artifact's files. Raises JobStoppedError when asked to stop."""
+
+    def combine(self, run: Run) -> Files | None:
+        """Return the stage's files, made of its jobs' artifacts; None when the only job's artifact is the stage's."""
+        return None
+
+    def origin(self, run: Run) -> dict[str, Any]:
+        """Return what names the stage's artifact: stage, version, seed, settings, and the content of its inputs."""
+        return {
+            "stage": self.name,
+            "version": self.version,
+            "seed": run.config.seed,
+            "settings": self.settings(run.config),
+            "inputs": {name: run.artifact(name).sha256 for name in self.inputs},
+        }
+
+    def job_origin(self, run: Run, job: str) -> dict[str, Any]:
+        """Return what names a job's artifact and checkpoints."""
+        origin = self.origin(run)
+        return origin if job == self.name else origin | {"job": job}
+
+    def checkpoints(self, run: Run, job: str) -> Checkpoints:
+        """Return the checkpoints of a job."""
+        return Checkpoints(run.directory.checkpoints(self.name, job), self.job_origin(run, job))
+
+
+def is_current(artifact: Artifact | None, origin: dict[str, Any]) -> bool:
+    """Return whether an artifact was made from exactly this origin."""
+    return artifact is not None and artifact.fingerprint == fingerprint(origin)

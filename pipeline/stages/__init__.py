@@ -1,0 +1,24 @@
+"""The stages, in order; which of them a run has follows from its configuration."""
+
+from pipeline.config import RunConfig
+from pipeline.stage import Stage
+
+
+def stages(config: RunConfig) -> list[Stage]:
+    """Return the stages of a run, each after those it reads from."""
+    from pipeline.stages.clustering import ClusteringStage
+    from pipeline.stages.demonstrations import DemonstrationsStage
+    from pipeline.stages.imitation import ImitationStage, NaiveGailStage, OracleStage
+    from pipeline.stages.transferability import TransferabilityStage
+
+    baselines: dict[str, Stage] = {stage.name: stage for stage in (NaiveGailStage(), OracleStage())}
+    method: list[Stage] = [DemonstrationsStage(), ClusteringStage(), TransferabilityStage(), ImitationStage()]
+    return method + [baselines[name] for name in config.baselines]
+
+
+def stage_named(config: RunConfig, name: str) -> Stage:
+    """Return a stage of the run by its name. Raises LookupError, naming those there are, if there is none."""
+    for stage in stages(config):
+        if stage.name == name:
+            return stage
+    raise LookupError(f"no stage {name!r}; this run has {', '.join(stage.name for stage in stages(config))}")

@@ -1,0 +1,109 @@
+"""Stage 4: the policy, by GAIL on weighted demonstrations (Eqn 7 and 8), and the baselines that differ in weights alone."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.algorithms.gail import AdversarialReward
+from pipeline.algorithms.learner import Learner
+from pipeline.artifacts import Files, encode_arrays, encode_json
+from pipeline.config import RunConfig
+from pipeline.data import Demonstrations
+from pipeline.environments import make_batch
+from pipeline.evaluation import evaluate
+from pipeline.seeding import torch_seed, derive_key
+from pipeline.stage import JobContext, Run, Stage
+from pipeline.stages.demonstrations import load_demonstrations, transferable_mask
+from pipeline.training import Probe, train
+
+
+class ImitationStage(Stage):
+    """Weighted GAIL: one learner fed by rollout workers. Subclasses choose the weights."""
+
+    name = "imitation"
+    version = 1
+    inputs: tuple[str, ...] = ("demonstrations", "transferability")
+    distributed = True
+
+    def settings(self, config: RunConfig) -> dict[str, Any]:
+        """Return the section and the imitator's environment."""
+        return config.imitation.model_dump(mode="json") | {"environment": config.environment.model_dump()}
+
+    def weights(self, run: Run, demonstrations: Demonstrations) -> NDArray[np.float64]:
+        """Return (N,) weights from the transferability."""
+        return run.artifact("transferability").arrays("transferability.safetensors")["weights"]
+
+    def run_job(self, run: Run, job: str, context: JobContext) -> Files:
+        """Train the policy and evaluate it with its mean action."""
+        config = run.config
+        gail = config.imitation.gail
+        environment = config.environment
+        demonstrations = load_demonstrations(run)
+        seed = torch_seed(derive_key(config.seed, "imitation"))
+        simulators = make_batch(environment.id, environment.dynamics, 1)
+        reward = AdversarialReward(demonstrations, self.weights(run, demonstrations), gail.discriminator, seed)
+        learner = Learner(simulators.observation_dim, simulators.action_dim, gail, reward, seed)
+
+        def curve_point() -> NDArray[np.float64]:
+            key = derive_key(config.seed, "curve")
+            seen = evaluate(
+                learner.behaviour_policy(), environment.id, environment.dynamics, gail.evaluation_episodes, key
+            )
+            return np.array([seen.returns.mean(), seen.returns.std(), seen.lengths.mean()])
+
+        probe = Probe("curve", gail.num_evaluations, curve_point)
+        history = train(learner, environment, gail, [probe], context, self.checkpoints(run, job))
+        policy = learner.behaviour_policy()
+        episodes = config.imitation.final_episodes
+        final = evaluate(policy, environment.id, environment.dynamics, episodes, derive_key(config.seed, "final"))
+        curve = history.values("curve").reshape(-1, 3)
+        discriminator = {name: value.numpy() for name, value in reward.discriminator.state_dict().items()}
+        return {
+            "policy.safetensors": encode_arrays(policy.arrays()),
+            "policy.json": encode_json({"environment": environment.model_dump(), "activation": "tanh"}),
+            "discriminator.safetensors": encode_arrays(discriminator),
+            "curve.json": encode_json(
+                {
+                    "env_steps": history.steps("curve").tolist(),
+                    "return_mean": curve[:, 0].tolist(),
+                    "return_std": curve[:, 1].tolist(),
+                    "length_mean": curve[:, 2].tolist(),
+                    "episodes": gail.evaluation_episodes,
+                }
+            ),
+            "evaluation.json": encode_json(
+                {
+                    "final_return": float(final.returns.mean()),
+                    "final_return_std": float(final.returns.std()),
+                    "final_length": float(final.lengths.mean()),
+                    "episodes": episodes,
+                    "env_steps": gail.num_iterations * gail.steps_per_iteration,
+                }
+            ),
+        }
+
+
+class NaiveGailStage(ImitationStage):
+    """GAIL on all demonstrations alike."""
+
+    name = "naive_gail"
+    inputs = ("demonstrations",)
+
+    def weights(self, run: Run, demonstrations: Demonstrations) -> NDArray[np.float64]:
+        """Return equal weights."""
+        return np.ones(len(demonstrations))
+
+
+class OracleStage(ImitationStage):
+    """GAIL on the demonstrations whose sources are marked transferable: what perfect scores would give."""
+
+    name = "oracle"
+    inputs = ("demonstrations",)
+
+    def weights(self, run: Run, demonstrations: Demonstrations) -> NDArray[np.float64]:
+        """Return one for the marked demonstrations and zero for all others."""
+        marked = transferable_mask(run.config, demonstrations)
+        if marked is None:
+            raise ValueError("the oracle needs every source marked transferable: true or false")
+        return marked.astype(np.float64)

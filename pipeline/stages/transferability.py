@@ -1,0 +1,113 @@
+"""Stage 3: one independent GAIL job per cluster; what its discriminators say of every demonstration (Eqn 5 and 6).
+
+The scores come from the last discriminators of each job. The true reward plays no part, not even in choosing them.
+"""
+
+from typing import Any
+
+import numpy as np
+from sklearn.metrics import roc_auc_score
+
+from pipeline.algorithms.gail import AdversarialReward
+from pipeline.algorithms.learner import Learner
+from pipeline.algorithms.transferability import (
+    mean_logit_per_demonstration,
+    sampling_mass,
+    sharpened_weights,
+    transferability,
+)
+from pipeline.artifacts import Files, encode_arrays, encode_json
+from pipeline.config import RunConfig
+from pipeline.environments import make_batch
+from pipeline.seeding import torch_seed, derive_key
+from pipeline.stage import JobContext, Run, Stage
+from pipeline.stages.demonstrations import load_demonstrations, transferable_mask
+from pipeline.training import Probe, train
+
+_JOB_FILE = "scores.safetensors"
+
+
+class TransferabilityStage(Stage):
+    """K jobs, each with its own checkpoint and artifact; empty clusters have no job."""
+
+    name = "transferability"
+    version = 1
+    inputs = ("demonstrations", "clustering")
+
+    def settings(self, config: RunConfig) -> dict[str, Any]:
+        """Return the section and the imitator's environment."""
+        return config.transferability.model_dump(mode="json") | {"environment": config.environment.model_dump()}
+
+    def jobs(self, run: Run) -> list[str]:
+        """Return one job per cluster that has demonstrations, named by the cluster's id."""
+        return [f"cluster-{k}" for k in np.unique(_labels(run))]
+
+    def run_job(self, run: Run, job: str, context: JobContext) -> Files:
+        """Imitate one cluster in the imitator's environment and score its demonstrations along the way."""
+        config = run.config
+        section = config.transferability
+        members = np.flatnonzero(_labels(run) == int(job.removeprefix("cluster-")))
+        demonstrations = load_demonstrations(run).select(members)
+        seed = torch_seed(derive_key(config.seed, self.name, job))
+        simulators = make_batch(config.environment.id, config.environment.dynamics, 1)
+        reward = AdversarialReward(demonstrations, np.ones(len(members)), section.gail.discriminator, seed)
+        learner = Learner(simulators.observation_dim, simulators.action_dim, section.gail, reward, seed)
+        probe = Probe(
+            "logits", section.num_scores, lambda: mean_logit_per_demonstration(reward.discriminator, demonstrations)
+        )
+        history = train(
+            learner, config.environment, section.gail, [probe], context, self.checkpoints(run, job)
+        )
+        discriminator = {name: value.numpy() for name, value in reward.discriminator.state_dict().items()}
+        return {
+            _JOB_FILE: encode_arrays(
+                {
+                    "demonstrations": members.astype(np.int64),
+                    "env_steps": history.steps("logits"),
+                    "logits": history.values("logits"),
+                }
+            ),
+            "discriminator.safetensors": encode_arrays(discriminator),
+            "policy.safetensors": encode_arrays(learner.behaviour_policy().arrays()),
+        }
+
+    def combine(self, run: Run) -> Files:
+        """Average each job's last scores, turn them into weights, and say how well the sources are told apart."""
+        config = run.config
+        demonstrations = load_demonstrations(run)
+        logits = np.full(len(demonstrations), np.nan)
+        history = {}
+        for job in self.jobs(run):
+            arrays = run.job_artifact(self.name, job).arrays(_JOB_FILE)
+            logits[arrays["demonstrations"]] = arrays["logits"][-config.transferability.averaged_scores :].mean(axis=0)
+            cluster = job.replace("-", "_")
+            history[f"{cluster}/env_steps"] = arrays["env_steps"]
+            history[f"{cluster}/scores"] = transferability(arrays["logits"])
+            history[f"{cluster}/demonstrations"] = arrays["demonstrations"]
+        scores = transferability(logits)
+        weights = sharpened_weights(scores, config.transferability.sharpening)
+        arrays = {"scores": scores, "weights": weights, "clusters": _labels(run)}
+        summary: dict[str, Any] = {
+            "sharpening": config.transferability.sharpening,
+            "mean_score_by_source": {
+                label: float(scores[demonstrations.sources == i].mean())
+                for i, label in enumerate(demonstrations.source_labels)
+            },
+        }
+        marked = transferable_mask(config, demonstrations)
+        if marked is not None and 0 < marked.sum() < len(marked):
+            uniform = np.ones(len(demonstrations))
+            summary |= {
+                "auroc": float(roc_auc_score(marked, scores)),
+                "transferable_share": float(sampling_mass(weights, demonstrations)[marked].sum()),
+                "transferable_share_before": float(sampling_mass(uniform, demonstrations)[marked].sum()),
+            }
+        return {
+            "transferability.safetensors": encode_arrays(arrays),
+            "history.safetensors": encode_arrays(history),
+            "summary.json": encode_json(summary),
+        }
+
+
+def _labels(run: Run) -> np.ndarray:
+    return run.artifact("clustering").arrays("assignment.safetensors")["labels"]

@@ -1,0 +1,213 @@
+"""The training loop that experts, cluster jobs and the final learner share.
+
+Iteration i is collected under policy version i - lag (version 0 at first). With lag 1 the units of iteration i + 1 are
+handed out before update i, so workers collect while the learner learns; the order is fixed, so the bits are too. All
+randomness is keyed by iteration, so a checkpoint holds no generator.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pipeline.algorithms.learner import Learner
+from pipeline.artifacts import Checkpoints
+from pipeline.config import EnvironmentConfig, TrainingConfig
+from pipeline.environments import Snapshot
+from pipeline.policy import GaussianPolicy
+from pipeline.rollout import Rollout, Unit
+from pipeline.seeding import derive_key
+from pipeline.stage import JobContext, JobStoppedError
+
+Arrays = dict[str, NDArray]
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Something measured now and then; it never influences the training."""
+
+    name: str
+    count: int
+    """Measurements, evenly spaced; the last one after the last iteration."""
+    measure: Callable[[], NDArray]
+    """Returns an array of fixed shape."""
+
+    def is_due(self, iteration: int, num_iterations: int) -> bool:
+        """Return whether to measure after this iteration."""
+        return (iteration + 1) * self.count // num_iterations > iteration * self.count // num_iterations
+
+
+class History:
+    """What the probes saw: for each, the environment steps and the measurements, in order."""
+
+    def __init__(self) -> None:
+        self._steps: dict[str, list[int]] = {}
+        self._values: dict[str, list[NDArray]] = {}
+
+    def append(self, name: str, env_steps: int, value: NDArray) -> None:
+        """Add one measurement."""
+        self._steps.setdefault(name, []).append(env_steps)
+        self._values.setdefault(name, []).append(np.asarray(value, np.float64))
+
+    def steps(self, name: str) -> NDArray[np.int64]:
+        """Return (P,) environment steps of a probe's measurements."""
+        return np.array(self._steps.get(name, []), np.int64)
+
+    def values(self, name: str) -> NDArray[np.float64]:
+        """Return (P, ...) measurements of a probe; empty when there is none."""
+        return np.stack(self._values[name]) if name in self._values else np.empty(0)
+
+    def arrays(self) -> Arrays:
+        """Return everything by name; `from_arrays` is the inverse."""
+        named = {f"{name}/steps": self.steps(name) for name in self._steps}
+        return named | {f"{name}/values": self.values(name) for name in self._values}
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays) -> "History":
+        """Rebuild a history from `arrays`."""
+        history = cls()
+        for key, steps in arrays.items():
+            name, _, field = key.rpartition("/")
+            if field == "steps":
+                history._steps[name] = steps.tolist()
+                history._values[name] = list(arrays[f"{name}/values"])
+        return history
+
+
+@dataclass
+class _Position:
+    """Where a training stands between two iterations."""
+
+    iteration: int
+    policy_version: int
+    policy: GaussianPolicy
+    """The one under which the next iteration is collected."""
+    snapshots: list[Snapshot | None]
+    history: History
+
+
+def train(
+    learner: Learner,
+    environment: EnvironmentConfig,
+    config: TrainingConfig,
+    probes: list[Probe],
+    context: JobContext,
+    checkpoints: Checkpoints,
+) -> History:
+    """Train until the budget is spent, from the newest checkpoint if there is one.
+
+    Raises JobStoppedError, after writing a checkpoint, when the context asks for a stop.
+    """
+    torch.set_num_threads(config.torch_threads)
+    position = _resume(learner, config, context, checkpoints)
+    last_checkpoint = time.monotonic()
+    returns, lengths = _Recent(), _Recent()
+    if position.iteration < config.num_iterations:
+        context.rollouts.submit(_units(position, learner.root_seed, environment, config))
+    for iteration in range(position.iteration, config.num_iterations):
+        results = context.rollouts.gather()
+        rollouts = [result.rollout for result in results]
+        position.snapshots = [result.snapshot for result in results]
+        position.iteration = iteration + 1
+        if config.lag == 0:
+            metrics = learner.update(rollouts, iteration)
+        position.policy, position.policy_version = learner.behaviour_policy(), iteration + 1 - config.lag
+        if position.iteration < config.num_iterations:
+            context.rollouts.submit(_units(position, learner.root_seed, environment, config))
+        if config.lag == 1:
+            metrics = learner.update(rollouts, iteration)
+        _refuse_divergence(learner, metrics, iteration)
+
+        env_steps = position.iteration * config.steps_per_iteration
+        for probe in probes:
+            if probe.is_due(iteration, config.num_iterations):
+                position.history.append(probe.name, env_steps, probe.measure())
+        returns.extend(rollouts, "episode_returns")
+        lengths.extend(rollouts, "episode_lengths")
+        context.progress(
+            env_steps,
+            config.num_iterations * config.steps_per_iteration,
+            **metrics,
+            **returns.mean("return"),
+            **lengths.mean("length"),
+        )
+        stop = context.should_stop()
+        if stop or time.monotonic() - last_checkpoint >= context.checkpoint_interval_s:
+            _save(learner, position, checkpoints)
+            last_checkpoint = time.monotonic()
+        if stop and position.iteration < config.num_iterations:
+            raise JobStoppedError(f"stopped after {env_steps} environment steps")
+    return position.history
+
+
+class _Recent:
+    """Mean over the last hundred ended episodes, for the progress line."""
+
+    def __init__(self) -> None:
+        self._values: list[float] = []
+
+    def extend(self, rollouts: list[Rollout], field: str) -> None:
+        for rollout in rollouts:
+            self._values.extend(getattr(rollout, field).tolist())
+        del self._values[:-100]
+
+    def mean(self, name: str) -> dict[str, float]:
+        return {name: float(np.mean(self._values))} if self._values else {}
+
+
+def _units(position: _Position, root_seed: int, environment: EnvironmentConfig, config: TrainingConfig) -> list[Unit]:
+    return [
+        Unit(
+            iteration=position.iteration,
+            group=group,
+            env_id=environment.id,
+            dynamics=tuple(sorted(environment.dynamics.items())),
+            num_simulators=config.simulators_per_group,
+            num_steps=config.steps_per_rollout,
+            policy_version=position.policy_version,
+            policy=position.policy,
+            key=derive_key(root_seed, "rollout", group, position.iteration),
+            snapshot=snapshot,
+        )
+        for group, snapshot in enumerate(position.snapshots)
+    ]
+
+
+def _refuse_divergence(learner: Learner, metrics: dict[str, float], iteration: int) -> None:
+    broken = [name for name, value in metrics.items() if not np.isfinite(value)]
+    if broken:
+        raise FloatingPointError(f"training diverged in iteration {iteration}: {', '.join(broken)} not finite")
+
+
+def _save(learner: Learner, position: _Position, checkpoints: Checkpoints) -> None:
+    arrays: Arrays = {"position": np.array([position.iteration, position.policy_version], np.int64)}
+    arrays |= {f"learner/{name}": value.numpy() for name, value in learner.state().items()}
+    arrays |= {f"policy/{name}": value for name, value in position.policy.arrays().items()}
+    arrays |= {f"history/{name}": value for name, value in position.history.arrays().items()}
+    for group, snapshot in enumerate(position.snapshots):
+        assert snapshot is not None
+        arrays[f"snapshot/{group}/states"] = snapshot.states
+        arrays[f"snapshot/{group}/elapsed_steps"] = snapshot.elapsed_steps
+        arrays[f"snapshot/{group}/episode_returns"] = snapshot.episode_returns
+    checkpoints.save(position.iteration, arrays)
+
+
+def _resume(learner: Learner, config: TrainingConfig, context: JobContext, checkpoints: Checkpoints) -> _Position:
+    arrays, warnings = checkpoints.load()
+    for warning in warnings:
+        context.warn(warning)
+    if arrays is None:
+        fresh: list[Snapshot | None] = [None] * config.num_groups
+        return _Position(0, 0, learner.behaviour_policy(), fresh, History())
+
+    def below(prefix: str) -> Arrays:
+        return {name[len(prefix) :]: value for name, value in arrays.items() if name.startswith(prefix)}
+
+    learner.load_state({name: torch.from_numpy(value.copy()) for name, value in below("learner/").items()})
+    iteration, version = (int(value) for value in arrays["position"])
+    snapshots: list[Snapshot | None] = [Snapshot(**below(f"snapshot/{g}/")) for g in range(config.num_groups)]
+    policy = GaussianPolicy.from_arrays(below("policy/"))
+    return _Position(iteration, version, policy, snapshots, History.from_arrays(below("history/")))

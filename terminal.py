@@ -1,0 +1,179 @@
+"""How a run looks in a terminal: live progress, plain lines elsewhere, tables at the end."""
+
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, JobWarning, WorkerRestarted
+
+if TYPE_CHECKING:
+    from pipeline.data import Demonstrations
+
+PLAIN_INTERVAL_S = 10.0
+"""Seconds between lines about one job where there is no terminal."""
+SHOWN_METRICS = ("return", "length", "loss", "value_loss")
+"""Figures of a job that are shown beside its bar."""
+
+
+class Display:
+    """What the orchestrator tells the user while it runs."""
+
+    def __init__(self) -> None:
+        self._console = Console()
+        self._progress = Progress(
+            TextColumn("  {task.description:<18}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TextColumn("{task.fields[rate]:>12}"),
+            TextColumn("{task.fields[figures]}"),
+            TimeElapsedColumn(),
+            TextColumn("eta"),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+        self._bars: dict[str, Any] = {}
+        self._started: dict[str, tuple[float, int]] = {}
+        self._spoken: dict[str, float] = {}
+
+    def __enter__(self) -> "Display":
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Take the live part away; what was said stays."""
+        self._progress.stop()
+
+    def say(self, message: str) -> None:
+        """Print one line above the live part."""
+        self._console.print(message, highlight=False)
+
+    def reused(self, stage: str) -> None:
+        """Say that a finished stage is taken as it is."""
+        self.say(f"[green]✓[/] {stage}: reused")
+
+    def stage_started(self, stage: str, reason: str, jobs: int) -> None:
+        """Say that a stage begins, and why if it is not its first time."""
+        self.say(f"[bold]▶ {stage}[/]" + (f" ({jobs} jobs)" if jobs > 1 else "") + (f": {reason}" if reason else ""))
+
+    def stage_finished(self, stage: str, seconds: float) -> None:
+        """Say that a stage is done and clear its bars."""
+        for bar in self._bars.values():
+            self._progress.remove_task(bar)
+        self._bars.clear()
+        self._started.clear()
+        self.say(f"[green]✓[/] {stage}: {_duration(seconds)}")
+
+    def event(self, event: Event) -> None:
+        """Show what an engine reports."""
+        match event:
+            case JobStarted(job=job):
+                self._bar(job)
+            case JobProgress(job=job, done=done, total=total, metrics=metrics):
+                self._advance(job, done, total, metrics)
+            case JobWarning(job=job, message=message):
+                self.say(f"[yellow]! {job}: {message}[/]")
+            case JobFailed(job=job, attempt=attempt, will_retry=will_retry, reason=reason):
+                then = "trying again" if will_retry else "giving up"
+                self.say(f"[red]✗ {job}: attempt {attempt} failed, {then}: {reason.strip().splitlines()[-1]}[/]")
+            case JobDone(job=job):
+                if job in self._bars:
+                    self._progress.update(self._bars[job], completed=1, total=1, figures="done")
+            case WorkerRestarted():
+                self.say(f"[yellow]! {event.name}: {event.reason}; started again[/]")
+
+    def _bar(self, job: str) -> Any:
+        if job not in self._bars:
+            self._bars[job] = self._progress.add_task(job, total=None, rate="", figures="")
+        return self._bars[job]
+
+    def _advance(self, job: str, done: int, total: int, metrics: dict[str, float]) -> None:
+        now = time.monotonic()
+        since, first = self._started.setdefault(job, (now, done))
+        rate = f"{(done - first) / (now - since):,.0f}/s" if now - since > 1 and done > first else ""
+        figures = "  ".join(f"{name} {metrics[name]:,.4g}" for name in SHOWN_METRICS if name in metrics)
+        self._progress.update(self._bar(job), completed=done, total=total, rate=rate, figures=figures)
+        if not self._console.is_terminal and now - self._spoken.get(job, now - PLAIN_INTERVAL_S) >= PLAIN_INTERVAL_S:
+            self._spoken[job] = now
+            left = (total - done) * (now - since) / (done - first) if done > first else float("nan")
+            eta = f"  eta {_duration(left)}" if np.isfinite(left) else ""
+            self.say(f"  {job}: {done:,}/{total:,}  {rate}  {figures}{eta}")
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(int(round(seconds)), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
+
+
+LABELS = {
+    "final_return": "final return, ours",
+    "naive_return": "final return, naive GAIL",
+    "oracle_return": "final return, oracle",
+    "purity": "cluster purity",
+    "auroc": "AUROC of the transferability",
+    "transferable_share": "transferable share of the sampling mass",
+    "env_steps": "environment steps",
+    "seconds": "time",
+}
+
+
+def print_summary(results: dict[str, float], report: Path) -> None:
+    """Print the results known so far and where the report is."""
+    console = Console()
+    table = Table(show_header=False, box=None, padding=(0, 2))
+    for name, label in LABELS.items():
+        if name in results:
+            table.add_row(label, _figure(name, results[name]))
+    console.print()
+    console.print(table)
+    console.print(f"\nreport: {report}", highlight=False, soft_wrap=True)
+
+
+def _figure(name: str, value: float) -> str:
+    if name == "seconds":
+        return _duration(value)
+    return f"{value:,.0f}" if name == "env_steps" or name.endswith("return") else f"{value:.3f}"
+
+
+def print_status(described: dict[str, Any]) -> None:
+    """Print the stages of a run and its results."""
+    console = Console()
+    table = Table("stage", "state", "seconds", "sha256", box=None, padding=(0, 2))
+    for name, entry in described["stages"].items():
+        seconds = f"{entry['seconds']:,.1f}" if "seconds" in entry else ""
+        table.add_row(name, entry["state"], seconds, (entry["sha256"] or entry.get("reason", ""))[:60])
+    console.print(f"{described['name']}, seed {described['seed']}  ({described['run']})", highlight=False)
+    console.print(table)
+    for name, value in described["results"].items():
+        console.print(f"  {LABELS.get(name, name)}: {_figure(name, value)}", highlight=False)
+
+
+def print_demonstrations(path: Path, demonstrations: "Demonstrations", environment: str) -> None:
+    """Print what a set of demonstrations contains, by source."""
+    console = Console()
+    lengths, counts = demonstrations.lengths, np.bincount(demonstrations.sources)
+    console.print(
+        f"{path}: {len(demonstrations)} demonstrations, {lengths.sum():,} states of {demonstrations.observation_dim} "
+        f"dimensions, environment {environment or 'not stated'}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    table = Table("source", "count", "states (min - max)", "return in its own dynamics", box=None, padding=(0, 2))
+    for i, label in enumerate(demonstrations.source_labels):
+        mine = demonstrations.sources == i
+        if mine.any():
+            returns = demonstrations.returns[mine]
+            shown = f"{returns.mean():,.0f} ± {returns.std():,.0f}" if np.isfinite(returns).all() else "not recorded"
+            table.add_row(label, str(counts[i]), f"{lengths[mine].min()} - {lengths[mine].max()}", shown)
+    console.print(table)

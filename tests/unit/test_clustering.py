@@ -1,0 +1,288 @@
+"""Assignment, centres and the whole of Algorithm 1; the stage gives the same bytes however often it is stopped."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from sklearn.metrics import calinski_harabasz_score, silhouette_score
+
+from pipeline.algorithms.clustering import (
+    ClusterModel,
+    ContrastiveClustering,
+    Labelling,
+    assign,
+    centre_loss,
+    moved_centres,
+)
+from pipeline.artifacts import RunDirectory, write_artifact
+from pipeline.config import ClusteringConfig, RunConfig
+from pipeline.data import DataError, Demonstrations
+from pipeline.stage import JobStoppedError, Run
+from pipeline.stages import clustering as stage_module
+from pipeline.stages.clustering import ClusteringStage, contingency, diagnostics, purity
+
+SMALL = {"hidden": 16, "warmup_iterations": 30, "joint_iterations": 40, "batch_size": 16}
+
+
+def three_dynamics(counts: tuple[int, int, int], seed: int = 0) -> Demonstrations:
+    """Ragged demonstrations of a slow oscillator, a fast one, and a random walk, with random phase and noise."""
+    rng = np.random.default_rng(seed)
+    states = []
+    for source, count in enumerate(counts):
+        for _ in range(count):
+            t = np.arange(rng.integers(60, 120))
+            phase = rng.uniform(0, 2 * np.pi)
+            if source == 2:
+                signal = 0.3 * rng.standard_normal((len(t), 2)).cumsum(axis=0)
+            else:
+                angle = phase + (0.05, 0.6)[source] * t
+                signal = np.stack((np.sin(angle), np.cos(angle)), axis=1)
+            states.append((signal + 0.02 * rng.standard_normal(signal.shape)).astype(np.float32))
+    return Demonstrations(
+        observations=np.concatenate(states),
+        offsets=np.cumsum([0, *(len(s) for s in states)]).astype(np.int64),
+        sources=np.repeat(np.arange(3, dtype=np.int32), counts),
+        source_labels=("slow", "fast", "walk"),
+        returns=np.full(sum(counts), np.nan),
+    )
+
+
+def test_the_nearest_centre_is_by_distance_also_when_centres_have_unequal_lengths():
+    centres = torch.tensor([[1.0, 0.0], [0.2, 0.2], [-3.0, 0.0]])
+    features = torch.tensor([[0.9, 0.1], [0.0, 1.0], [-1.0, 0.0]])
+    # Squared distances: (.02, .50, 15.2), (2, .68, 10), (4, 1.48, 4).
+    assert assign(features, centres).tolist() == [0, 1, 1]
+    assert assign(features[None], centres).tolist() == [[0, 1, 1]]
+
+
+def test_the_centre_loss_by_hand():
+    features = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    own = torch.tensor([[0.0, 0.0], [0.0, 3.0]])
+    # Squared distances 1 and 4, halved and added.
+    assert float(centre_loss(features, own, "sum")) == pytest.approx(2.5)
+    assert float(centre_loss(features, own, "mean")) == pytest.approx(1.25)
+
+
+def test_centres_move_as_in_a_sequential_loop_over_eqn_4():
+    rng = np.random.default_rng(0)
+    centres, counts = rng.standard_normal((4, 3)), np.array([100, 7, 100, 1])
+    features, labels = rng.standard_normal((50, 3)), rng.integers(0, 3, 50)
+
+    moved, new_counts = moved_centres(*(torch.from_numpy(a) for a in (centres, counts, features, labels)))
+
+    expected, expected_counts = centres.copy(), counts.copy()
+    for f, k in zip(features, labels, strict=True):
+        expected_counts[k] += 1
+        expected[k] = (1 - 1 / expected_counts[k]) * expected[k] + f / expected_counts[k]
+    np.testing.assert_allclose(moved.numpy(), expected, rtol=1e-12)
+    np.testing.assert_array_equal(new_counts.numpy(), expected_counts)
+    np.testing.assert_array_equal(moved[3].numpy(), centres[3])  # no members, no change
+
+
+def test_three_dynamics_are_told_apart_and_empty_clusters_are_legal():
+    demonstrations = three_dynamics((6, 30, 30))
+    config = ClusteringConfig(hidden=32, warmup_iterations=100, joint_iterations=100, num_clusters=5)
+    clustering = ContrastiveClustering(demonstrations, config, root_seed=0)
+    while clustering.iteration < clustering.num_iterations:
+        clustering.update()
+    labelling = clustering.model().label(demonstrations, draws=5, root_seed=0)
+
+    report = diagnostics(labelling, demonstrations, 5)
+    assert report["purity"] == 1.0
+    assert report["label_stability"] > 0.9
+    np.testing.assert_allclose(np.linalg.norm(labelling.features, axis=1), 1, rtol=1e-5)
+    # The frozen model finds the same dynamics in demonstrations that it has never seen.
+    new = three_dynamics((10, 10, 10), seed=1)
+    rebuilt = ClusterModel.from_arrays(clustering.model().arrays())
+    joint = contingency(labelling.labels, demonstrations.sources, 5, 3)
+    owner = joint.argmax(axis=0)
+    found = rebuilt.label(new, draws=5, root_seed=0)
+    assert (owner[found.labels] == new.sources).mean() > 0.9
+
+
+def test_a_model_without_training_data_for_a_centre_leaves_that_cluster_empty():
+    demonstrations = three_dynamics((3, 3, 3))
+    model = ContrastiveClustering(demonstrations, ClusteringConfig(**SMALL, num_clusters=3), 0).model()
+    features = model.label(demonstrations, draws=1, root_seed=0).features
+    far = torch.stack((torch.from_numpy(features.mean(axis=0)), torch.full((16,), 9.0)))
+    labelling = ClusterModel(
+        model.encoder, far, torch.ones(2), model.sampling, model.state_mean, model.state_scale
+    ).label(demonstrations, draws=2, root_seed=0)
+    report = diagnostics(labelling, demonstrations, 2)
+    assert report["cluster_sizes"] == [9, 0]
+    assert (report["non_empty_clusters"], report["silhouette"], report["calinski_harabasz"]) == (1, None, None)
+
+
+def test_diagnostics_by_hand():
+    demonstrations = three_dynamics((2, 3, 1))
+    features = np.array([[1, 0], [1, 0.1], [0, 1], [0.1, 1], [0, 1], [0.9, 0]], np.float32)
+    labels = np.array([0, 0, 3, 3, 3, 0], np.int32)
+    report = diagnostics(Labelling(labels, features, stability=0.75), demonstrations, num_clusters=4)
+    assert report["contingency"] == {"slow": [2, 0, 0, 0], "fast": [0, 0, 0, 3], "walk": [1, 0, 0, 0]}
+    assert report["purity"] == pytest.approx(5 / 6)
+    assert report["cluster_sizes"] == [3, 0, 0, 3]
+    assert (report["num_clusters"], report["non_empty_clusters"], report["label_stability"]) == (4, 2, 0.75)
+    assert report["silhouette"] == pytest.approx(silhouette_score(features, labels, metric="cosine"))
+    assert report["calinski_harabasz"] == pytest.approx(calinski_harabasz_score(features, labels))
+    assert purity(np.array([[2, 0], [2, 0]])) == 0.5
+
+
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+@pytest.mark.parametrize("centres", ["trajectories", "kmeans"])
+@pytest.mark.parametrize("order", ["step_first", "centres_first"])
+def test_every_reading_of_the_method_trains(reduction, centres, order):
+    config = ClusteringConfig(**SMALL, num_clusters=3, reduction=reduction, initial_centres=centres, update_order=order)
+    clustering = ContrastiveClustering(three_dynamics((4, 4, 4)), config, 0)
+    first = clustering.update()
+    while clustering.iteration < config.warmup_iterations:
+        assert not clustering.counts.sub(100).any()  # centres rest while the encoder warms up
+        last = clustering.update()
+    assert last["contrastive_loss"] < first["contrastive_loss"]
+    clustering.update()
+    assert int(clustering.counts.sum()) == 3 * 100 + 2 * 12  # both views of all 12 demonstrations: fewer than a batch
+    torch.testing.assert_close(clustering.centres.norm(dim=1), torch.ones(3))
+
+
+def test_the_official_preset_trains_without_normalised_centres():
+    config = ClusteringConfig.model_validate({"preset": "official", **SMALL, "subtrajectory_length": 7})
+    clustering = ContrastiveClustering(three_dynamics((6, 6, 6)), config, 0)
+    while clustering.iteration < clustering.num_iterations:
+        clustering.update()
+    assert clustering.model().sampling.stride == 7
+    assert (clustering.centres.norm(dim=1) < 1).all()  # means of unit vectors that differ
+
+
+def test_more_clusters_than_demonstrations_are_refused():
+    with pytest.raises(DataError, match="3 demonstrations cannot form 5 clusters"):
+        ContrastiveClustering(three_dynamics((1, 1, 1)), ClusteringConfig(num_clusters=5), 0)
+
+
+def test_a_model_refuses_states_of_another_dimension_and_arrays_that_do_not_fit():
+    demonstrations = three_dynamics((2, 2, 2))
+    model = ContrastiveClustering(demonstrations, ClusteringConfig(**SMALL, num_clusters=2), 0).model()
+    wide = Demonstrations(np.zeros((9, 3), np.float32), np.array([0, 9]), np.zeros(1, np.int32), ("only",), np.zeros(1))
+    with pytest.raises(DataError, match="3 dimensions.*2"):
+        model.label(wide, draws=1, root_seed=0)
+    arrays = model.arrays()
+    with pytest.raises(ValueError, match="no array 'stride'"):
+        ClusterModel.from_arrays({name: value for name, value in arrays.items() if name != "stride"})
+    with pytest.raises(ValueError, match="do not fit"):
+        ClusterModel.from_arrays(arrays | {"lstm.weight_ih_l0": np.zeros((3, 3), np.float32)})
+
+
+class Context:
+    """A job's context that asks it to stop after so many iterations and keeps what was reported."""
+
+    rollouts = None
+
+    def __init__(self, stop_after: int | None = None, checkpoint_interval_s: float = 1e9) -> None:
+        self.checkpoint_interval_s = checkpoint_interval_s
+        self.stop_after = stop_after
+        self.reports: list[tuple[int, int]] = []
+        self.warnings: list[str] = []
+
+    def progress(self, done: int, total: int, **metrics: float) -> None:
+        assert np.isfinite(metrics["loss"])
+        self.reports.append((done, total))
+
+    def warn(self, message: str) -> None:
+        self.warnings.append(message)
+
+    def should_stop(self) -> bool:
+        return len(self.reports) == self.stop_after
+
+
+@pytest.fixture
+def make_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
+    """Return a function that prepares a run whose demonstrations are those of three dynamics."""
+    demonstrations = three_dynamics((4, 8, 8))
+    monkeypatch.setattr(stage_module, "load_demonstrations", lambda run: demonstrations)
+
+    def make(name: str, seed: int = 0, **clustering) -> Run:
+        config = RunConfig.model_validate(
+            {
+                "name": name,
+                "seed": seed,
+                "environment": {"id": "oodil/Hopper-v0"},
+                "demonstrations": {"file": "unused"},
+                "clustering": {**SMALL, "num_clusters": 4, **clustering},
+                "transferability": {"gail": {"total_steps": 1}},
+                "imitation": {"gail": {"total_steps": 1}},
+            }
+        )
+        directory = RunDirectory(tmp_path / name)
+        write_artifact(directory.stage("demonstrations"), {}, {})
+        return Run(config, directory)
+
+    return make
+
+
+STAGE = ClusteringStage()
+
+
+def test_interrupted_and_resumed_equals_uninterrupted_to_the_bit(make_run):
+    whole = STAGE.run_job(make_run("whole"), "clustering", Context())
+
+    stopped = make_run("stopped")
+    for after in (10, 20, 25):  # in the warm-up, when the centres are placed, among the joint iterations
+        with pytest.raises(JobStoppedError):
+            STAGE.run_job(stopped, "clustering", Context(stop_after=after))
+    context = Context()
+    assert STAGE.run_job(stopped, "clustering", context) == whole
+    assert context.reports[0] == (56, 70) and context.reports[-1] == (70, 70)
+
+
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(make_run):
+    whole = STAGE.run_job(make_run("whole"), "clustering", Context())
+    run = make_run("damaged")
+    with pytest.raises(JobStoppedError):
+        STAGE.run_job(run, "clustering", Context(stop_after=40, checkpoint_interval_s=0))
+    file = run.directory.checkpoints("clustering", "clustering") / f"{40:09d}" / "state.safetensors"
+    file.write_bytes(file.read_bytes()[:-100])
+    context = Context()
+    assert STAGE.run_job(run, "clustering", context) == whole
+    assert context.reports[0] == (40, 70)
+    assert len(context.warnings) == 1 and f"{40:09d}" in context.warnings[0]
+
+
+def test_a_finished_job_that_is_resumed_only_labels_again(make_run):
+    run = make_run("twice")
+    first = STAGE.run_job(run, "clustering", Context(checkpoint_interval_s=0))
+    context = Context()
+    assert STAGE.run_job(run, "clustering", context) == first
+    assert context.reports == []
+
+
+def test_the_files_of_the_stage(make_run):
+    run = make_run("files")
+    files = STAGE.run_job(run, "clustering", Context())
+    artifact = write_artifact(run.directory.stage("clustering"), STAGE.origin(run), files)
+
+    assignment = artifact.arrays("assignment.safetensors")
+    assert assignment["labels"].dtype == np.int32 and assignment["labels"].shape == (20,)
+    assert assignment["features"].dtype == np.float32 and assignment["features"].shape == (20, 16)
+    model = ClusterModel.from_arrays(artifact.arrays("encoder.safetensors"))
+    demonstrations = stage_module.load_demonstrations(run)
+    np.testing.assert_array_equal(model.label(demonstrations, 5, root_seed=0).labels, assignment["labels"])
+    report = artifact.json("diagnostics.json")
+    assert sum(report["cluster_sizes"]) == 20
+    assert report["shortened_subtrajectories"] == 0
+    assert set(report["contingency"]) == {"slow", "fast", "walk"}
+
+
+def test_another_seed_gives_another_encoder(make_run):
+    files = [STAGE.run_job(make_run(f"seed-{s}", seed=s), "clustering", Context()) for s in (0, 1)]
+    assert files[0]["encoder.safetensors"] != files[1]["encoder.safetensors"]
+
+
+def test_one_cluster_takes_everything_without_training(make_run):
+    run = make_run("one", num_clusters=1)
+    context = Context()
+    artifact = write_artifact(run.directory.stage("clustering"), {}, STAGE.run_job(run, "clustering", context))
+    assert context.reports == []
+    assert not artifact.arrays("assignment.safetensors")["labels"].any()
+    report = artifact.json("diagnostics.json")
+    assert report["cluster_sizes"] == [20] and report["silhouette"] is None
+    assert report["purity"] == pytest.approx(8 / 20)

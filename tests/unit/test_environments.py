@@ -1,0 +1,283 @@
+"""The batched simulators against Gymnasium, step by step and to the bit; snapshots; dynamics that really change."""
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from pipeline.environments import batched_ids, make_batch
+
+HOPPER, WALKER, CHEETAH = "oodil/Hopper-v0", "oodil/Walker2d-v0", "oodil/HalfCheetah-v0"
+
+
+def set_gravity(model):
+    model.opt.gravity[2] = -12.0
+
+
+def set_friction(model):
+    model.geom("foot_geom").friction[0] = 3.9
+    model.geom("foot_left_geom").friction[0] = 3.9
+
+
+def set_gears(model):
+    for name in ("fthigh", "fshin", "ffoot"):
+        model.actuator(name).gear[0] *= 0.05
+    for name in ("bthigh", "bshin", "bfoot"):
+        model.actuator(name).gear[0] *= 0.9
+
+
+SAME_DYNAMICS = [
+    (HOPPER, "Hopper-v5", {}, None),
+    (HOPPER, "Hopper-v5", {"gravity": 12.0}, set_gravity),
+    (WALKER, "Walker2d-v5", {}, None),
+    (WALKER, "Walker2d-v5", {"friction": 3.9}, set_friction),
+    (CHEETAH, "HalfCheetah-v5", {}, None),
+    (CHEETAH, "HalfCheetah-v5", {"front": 0.05, "back": 0.9}, set_gears),
+]
+
+
+def gymnasium_env(base, change, **kwargs):
+    env = gymnasium.make(base, exclude_current_positions_from_observation=False, **kwargs)
+    if change:
+        change(env.unwrapped.model)
+    return env
+
+
+def assert_equal_steps(batch, envs, num_steps, actions):
+    """Step both sides together and reset ended simulators by the same seeds; return how many episodes ended how."""
+    for g, env in enumerate(envs):
+        batch.reset(g, seed=g)
+        np.testing.assert_array_equal(batch.observations()[g], env.reset(seed=g)[0])
+    terminations = truncations = 0
+    returns = np.zeros(len(envs))
+    lengths = np.zeros(len(envs), int)
+    for t in range(num_steps):
+        action = actions(t)
+        outcome, observations = batch.step(action), batch.observations()
+        lengths += 1
+        for g, env in enumerate(envs):
+            expected, reward, terminated, truncated, _ = env.step(action[g])
+            assert observations[g].tobytes() == expected.tobytes(), (t, g)
+            assert (outcome.env_rewards[g], outcome.terminated[g], outcome.truncated[g]) == (
+                reward,
+                terminated,
+                truncated,
+            ), (t, g)
+            returns[g] += reward
+            assert batch.episode_returns()[g] == returns[g]
+            assert batch.elapsed_steps()[g] == lengths[g]
+            if terminated or truncated:
+                terminations += terminated
+                truncations += truncated
+                seed = 1000 + len(envs) * t + g
+                expected, _ = env.reset(seed=seed)
+                batch.reset(g, seed=seed)
+                assert batch.observations()[g].tobytes() == expected.tobytes()
+                returns[g] = lengths[g] = 0
+    return terminations, truncations
+
+
+def random_actions(batch, size=1.0, dtype=np.float32):
+    """A little beyond the range of the actuators, so that both sides have to clip alike."""
+    rng = np.random.default_rng(0)
+    return lambda t: rng.uniform(-1.3 * size, 1.3 * size, (batch.num_simulators, batch.action_dim)).astype(dtype)
+
+
+@pytest.mark.parametrize(("env_id", "base", "dynamics", "change"), SAME_DYNAMICS)
+def test_batch_equals_gymnasium(env_id, base, dynamics, change):
+    batch = make_batch(env_id, dynamics, 4)
+    envs = [gymnasium_env(base, change) for _ in range(4)]
+    num_steps = 1050 if base == "HalfCheetah-v5" else 300
+    terminations, truncations = assert_equal_steps(batch, envs, num_steps, random_actions(batch))
+    if base == "HalfCheetah-v5":
+        assert (terminations, truncations) == (0, 4)
+    else:
+        assert terminations > 20
+
+
+@pytest.mark.parametrize(("env_id", "base", "dynamics", "change"), [SAME_DYNAMICS[0], SAME_DYNAMICS[2]])
+def test_batch_equals_gymnasium_at_the_time_limit(env_id, base, dynamics, change):
+    """Episodes that may go on when the robot has fallen last to the limit and are truncated there."""
+    forever = {"terminate_when_unhealthy": False}
+    batch = make_batch(env_id, dynamics | forever, 2)
+    envs = [gymnasium_env(base, change, **forever) for _ in range(2)]
+    assert assert_equal_steps(batch, envs, 1010, random_actions(batch, 0.2)) == (0, 2)
+
+
+def test_batch_equals_gymnasium_with_double_precision_actions():
+    batch = make_batch(HOPPER, {}, 2)
+    assert_equal_steps(batch, [gymnasium_env("Hopper-v5", None) for _ in range(2)], 60, random_actions(batch, 1, float))
+
+
+@pytest.mark.parametrize(("env_id", "base", "dynamics", "change"), SAME_DYNAMICS[1::2])
+def test_registered_environment_equals_gymnasium(env_id, base, dynamics, change):
+    ours, theirs = gymnasium.make(env_id, **dynamics), gymnasium_env(base, change)
+    rng = np.random.default_rng(0)
+    assert ours.observation_space.shape == theirs.observation_space.shape
+    assert ours.spec.max_episode_steps == theirs.spec.max_episode_steps == 1000
+    for episode in range(5):
+        np.testing.assert_array_equal(ours.reset(seed=episode)[0], theirs.reset(seed=episode)[0])
+        for _ in range(60):
+            action = rng.uniform(-1, 1, ours.action_space.shape).astype(np.float32)
+            one, two = ours.step(action), theirs.step(action)
+            assert one[0].tobytes() == two[0].tobytes()
+            assert one[1:4] == two[1:4]
+            if one[2]:
+                break
+
+
+@pytest.mark.parametrize("env_id", [HOPPER, WALKER, CHEETAH])
+@pytest.mark.filterwarnings("ignore:.*A Box observation space.*")
+def test_gymnasium_checker_passes(env_id):
+    check_env(gymnasium.make(env_id).unwrapped, skip_render_check=True)
+
+
+def test_registered_ids():
+    assert {HOPPER, WALKER, CHEETAH} <= set(batched_ids())
+
+
+@pytest.mark.parametrize("env_id", [HOPPER, WALKER, CHEETAH])
+def test_a_snapshot_continues_to_the_same_bits(env_id, assert_same_bits):
+    batch = make_batch(env_id, {}, 3)
+    actions = random_actions(batch)
+    plan = [actions(t) for t in range(450)]
+
+    def play(simulators, first, last):
+        history = []
+        for t in range(first, last):
+            outcome = simulators.step(plan[t])
+            history.append((simulators.observations(), outcome, simulators.elapsed_steps(), simulators.episode_returns()))
+            for g in np.flatnonzero(outcome.terminated | outcome.truncated):
+                simulators.reset(int(g), seed=3 * t + int(g))
+        return history
+
+    for g in range(3):
+        batch.reset(g, seed=g)
+    play(batch, 0, 150)
+    assert batch.elapsed_steps().any(), "the snapshot is to lie within an episode"
+    snapshot = batch.snapshot()
+    kept = snapshot.states.copy()
+    expected = play(batch, 150, 450)
+    batch.restore(snapshot)
+    assert_same_bits(play(batch, 150, 450), expected)
+    other = make_batch(env_id, {}, 3)
+    for g in range(3):
+        other.reset(g, seed=77)
+    other.restore(snapshot)
+    assert_same_bits(play(other, 150, 450), expected)
+    np.testing.assert_array_equal(snapshot.states, kept)
+
+
+@pytest.mark.parametrize("taken_from", [2, 4])
+def test_a_snapshot_of_another_size_is_refused(taken_from):
+    with pytest.raises(ValueError, match="snapshot"):
+        make_batch(HOPPER, {}, 3).restore(make_batch(HOPPER, {}, taken_from).snapshot())
+
+
+def test_a_snapshot_of_another_model_is_refused():
+    with pytest.raises(ValueError, match="snapshot"):
+        make_batch(HOPPER, {}, 3).restore(make_batch(WALKER, {}, 3).snapshot())
+
+
+def test_a_simulator_does_not_depend_on_its_neighbours():
+    one, two = make_batch(HOPPER, {}, 2), make_batch(HOPPER, {}, 2)
+    rng = np.random.default_rng(0)
+    for batch, seed in ((one, 1), (two, 2)):
+        batch.reset(0, seed=seed)
+        batch.reset(1, seed=9)
+    for _ in range(50):
+        action = rng.uniform(-1, 1, (2, 3))
+        one.step(action)
+        two.step(action)
+    assert one.observations()[1].tobytes() == two.observations()[1].tobytes()
+    assert one.observations()[0].tobytes() != two.observations()[0].tobytes()
+
+
+@pytest.mark.parametrize("gravity", [1.0, 9.81, 15.0])
+def test_gravity_accelerates_a_hopper_in_the_air(gravity):
+    env = gymnasium.make(HOPPER, gravity=gravity).unwrapped
+    env.reset(seed=0)
+    env.data.qpos[1] = 5.0
+
+    def fall():
+        mujoco.mj_forward(env.model, env.data)
+        mujoco.mj_subtreeVel(env.model, env.data)
+        return env.data.subtree_linvel[0, 2]
+
+    before = fall()
+    env.do_simulation(np.zeros(3), 50)
+    elapsed = 50 * env.model.opt.timestep
+    # The joints are damped against the air, hence not to the last digit.
+    assert (fall() - before) / elapsed == pytest.approx(-gravity, rel=1e-2)
+
+
+def foot_friction(friction):
+    """Sliding friction in an actual contact of a foot with the floor."""
+    env = gymnasium.make(WALKER, friction=friction).unwrapped
+    env.reset(seed=0)
+    for _ in range(100):
+        env.step(np.zeros(6))
+        for contact in env.data.contact:
+            names = {env.model.geom(int(geom)).name for geom in contact.geom}
+            if names & {"foot_geom", "foot_left_geom"} and "floor" in names:
+                return contact.friction[0]
+    raise AssertionError("no foot touched the floor")
+
+
+@pytest.mark.parametrize(("friction", "effective"), [(24.8, 24.8), (1.1, 1.1), (0.7, 0.7), (0.1, 0.7)])
+def test_friction_of_the_feet_is_the_larger_of_the_two_surfaces(friction, effective):
+    assert foot_friction(friction) == pytest.approx(effective)
+
+
+def test_frictions_below_the_floors_are_the_same_dynamics():
+    def play(friction):
+        batch = make_batch(WALKER, {"friction": friction}, 1)
+        batch.reset(0, seed=0)
+        rng = np.random.default_rng(0)
+        for _ in range(40):
+            batch.step(rng.uniform(-1, 1, (1, 6)))
+        return batch.observations().tobytes()
+
+    assert play(0.1) == play(0.7)
+    assert play(0.1) != play(3.9)
+
+
+def test_motors_of_the_cheetah_scale_by_leg():
+    def forces(**scales):
+        env = gymnasium.make(CHEETAH, **scales).unwrapped
+        env.reset(seed=0)
+        env.data.ctrl[:] = 1.0
+        mujoco.mj_forward(env.model, env.data)
+        names = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
+        return np.array([env.data.qfrc_actuator[env.model.joint(name).dofadr[0]] for name in names])
+
+    full = forces()
+    np.testing.assert_allclose(full, [120, 90, 60, 120, 60, 30])
+    np.testing.assert_allclose(forces(front=0.05), full * [1, 1, 1, 0.05, 0.05, 0.05])
+    np.testing.assert_allclose(forces(back=0.5, front=0.9), full * [0.5, 0.5, 0.5, 0.9, 0.9, 0.9])
+
+
+def test_one_environments_dynamics_do_not_leak_into_another():
+    heavy, plain = gymnasium.make(HOPPER, gravity=15.0), gymnasium.make(HOPPER)
+    assert heavy.unwrapped.model.opt.gravity[2] == -15.0
+    assert plain.unwrapped.model.opt.gravity[2] == -9.81
+
+
+@pytest.mark.parametrize(
+    ("env_id", "dynamics", "error", "message"),
+    [
+        ("oodil/Hoper-v0", {}, ValueError, "oodil/Hoper-v0"),
+        ("CartPole-v1", {}, ValueError, "no batched form.*oodil/Hopper-v0"),
+        (HOPPER, {"gravity": 0.0}, ValueError, "gravity is 0.0"),
+        (HOPPER, {"gravity": float("nan")}, ValueError, "gravity is nan"),
+        (HOPPER, {"gravity": float("inf")}, ValueError, "gravity is inf"),
+        (WALKER, {"friction": -1.0}, ValueError, "friction is -1.0"),
+        (CHEETAH, {"front": -0.1}, ValueError, "front and back are -0.1"),
+        (CHEETAH, {"back": float("nan")}, ValueError, "front and back are 1.0 and nan"),
+        (HOPPER, {"friction": 1.0}, TypeError, "friction"),
+    ],
+)
+def test_bad_environments_are_refused(env_id, dynamics, error, message):
+    with pytest.raises(error, match=message):
+        make_batch(env_id, dynamics, 1)

@@ -1,0 +1,149 @@
+"""The adversarial reward: weights, draws, and which reward belongs to which step."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chisquare
+
+from pipeline.algorithms.discriminator import imitation_reward
+from pipeline.algorithms.gail import AdversarialReward
+from pipeline.config import DiscriminatorConfig
+
+
+def build(demonstrations, weights, **settings):
+    return AdversarialReward(demonstrations, np.array(weights, np.float64), DiscriminatorConfig(**settings), root_seed=0)
+
+
+def drawn_numbers(pairs):
+    """Demonstration and time of the first state of each drawn pair, after checking the second is its successor."""
+    first, second = pairs.numpy()[:, :3], pairs.numpy()[:, 3:]
+    np.testing.assert_array_equal(second[:, 0], first[:, 0], err_msg="a pair crosses a border")
+    np.testing.assert_array_equal(second[:, 1], first[:, 1] + 1)
+    return first[:, 0].astype(int), first[:, 1].astype(int)
+
+
+def test_draws_follow_the_weights(demonstrations):
+    lengths, weights = np.array([5, 2, 9, 4]), np.array([0.3, 1.0, 0.05, 0.6])
+    reward = build(demonstrations(*lengths), weights)
+    count = 20_000
+    chosen, times = drawn_numbers(reward.draw(count, np.random.default_rng(0)))
+    # The mass of a demonstration is its weight times its transitions, and all its transitions share it equally.
+    mass = np.repeat(weights, lengths - 1)
+    places = np.concatenate([[0], np.cumsum(lengths - 1)])[chosen] + times
+    assert times.max() == 7, "the last transition of the longest demonstration was never drawn"
+    observed = np.bincount(places, minlength=len(mass))
+    assert chisquare(observed, count * mass / mass.sum()).pvalue > 1e-3
+
+
+def test_no_weight_no_draw(demonstrations):
+    reward = build(demonstrations(4, 3, 5, 4), [0.0, 1.0, 0.0, 0.5])
+    chosen, _ = drawn_numbers(reward.draw(5_000, np.random.default_rng(0)))
+    assert set(chosen) == {1, 3}
+
+
+def test_the_ends_of_the_unit_interval_hit_no_unweighted_demonstration(demonstrations):
+    class Ends:
+        def random(self, count):
+            return np.array([0.0, np.nextafter(1.0, 0.0)] * (count // 2))
+
+    for weights, expected in (([0.0, 0.7, 0.3, 0.0], {1, 2}), ([0.0, 0.0, 1e-9, 0.0], {2})):
+        chosen, _ = drawn_numbers(build(demonstrations(3, 3, 3, 3), weights).draw(2, Ends()))
+        assert set(chosen) == expected
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ([1.0, 1.0], "3 finite numbers"),
+        ([1.0, np.nan, 1.0], "finite"),
+        ([1.0, np.inf, 1.0], "finite"),
+        ([1.0, -0.1, 1.0], ">= 0"),
+        ([0.0, 0.0, 0.0], "nothing to imitate"),
+    ],
+)
+def test_bad_weights_are_refused(demonstrations, weights, message):
+    with pytest.raises(ValueError, match=message):
+        build(demonstrations(3, 3, 3), weights)
+
+
+def test_rewards_belong_to_the_steps_that_earned_them(demonstrations, rollout):
+    """Groups stand side by side: reward [t, g] is that of step t of simulator g."""
+    reward = build(demonstrations(5, 5), [1.0, 1.0])
+    rollouts = [rollout(0, num_simulators=2), rollout(1, num_simulators=3)]
+    result = reward.rewards(rollouts)
+    assert result.shape == (6, 5)
+    for t in range(6):
+        for g, (part, column) in enumerate([(0, 0), (0, 1), (1, 0), (1, 1), (1, 2)]):
+            states = rollouts[part].observations[t, column], rollouts[part].next_observations[t, column]
+            with torch.no_grad():
+                logit = reward.discriminator(torch.from_numpy(np.concatenate(states))[None])
+            assert result[t, g] == pytest.approx(float(imitation_reward(logit)[0]), rel=1e-5)
+
+
+def test_update_raises_the_reward_of_demonstrations(demonstrations, rollout):
+    shown = demonstrations(30, 30)
+    reward = build(shown, [1.0, 1.0], learning_rate=1e-2)
+    pairs = reward.draw(50, np.random.default_rng(0))
+    rollouts = [rollout(0, num_steps=20)]
+
+    def margin():
+        with torch.no_grad():
+            return float(imitation_reward(reward.discriminator(pairs)).mean()) - float(reward.rewards(rollouts).mean())
+
+    before = margin()
+    for iteration in range(20):
+        reward.update(rollouts, iteration)
+    assert margin() > before + 0.1
+
+
+@pytest.mark.parametrize(("num_states", "num_steps", "expected"), [(40, 4, 12), (10, 50, 9)])
+def test_as_many_demonstration_pairs_as_policy_pairs_or_all(
+    demonstrations, rollout, monkeypatch, num_states, num_steps, expected
+):
+    reward = build(demonstrations(num_states), [1.0])
+    counts = []
+    monkeypatch.setattr(reward.discriminator, "update", lambda shown, policy: counts.append((len(shown), len(policy))))
+    reward.update([rollout(0, num_steps=num_steps)], 0)
+    # 4 steps of 3 simulators against 39 transitions: 12 of each; 50 steps against 9 transitions: 9 draws.
+    assert counts == [(expected, 3 * num_steps)]
+
+
+def test_an_update_depends_on_the_iteration_and_not_on_what_was_drawn_before(demonstrations, rollout, assert_same_bits):
+    one, two = (build(demonstrations(20, 20), [1.0, 0.5], steps_per_iteration=3) for _ in range(2))
+    two.draw(17, np.random.default_rng(9))
+    for iteration in range(2):
+        one.update([rollout(iteration)], iteration)
+        two.update([rollout(iteration)], iteration)
+    assert_same_bits(one.state(), two.state())
+
+
+def test_an_artificial_reward_of_the_environment_changes_nothing(demonstrations, rollout, assert_same_bits):
+    plain = rollout(0)
+    poisoned = replace(plain, env_rewards=np.full_like(plain.env_rewards, np.nan))
+    one, two = (build(demonstrations(20), [1.0]) for _ in range(2))
+    assert_same_bits(one.rewards([plain]), two.rewards([poisoned]))
+    one.update([plain], 0)
+    two.update([poisoned], 0)
+    assert_same_bits(one.state(), two.state())
+
+
+def test_state_restores_another_instance(demonstrations, rollout, assert_same_bits):
+    one = build(demonstrations(20), [1.0])
+    one.update([rollout(0)], 0)
+    two = AdversarialReward(demonstrations(20), np.ones(1), DiscriminatorConfig(), root_seed=0)
+    two.load_state({name: value.clone() for name, value in one.state().items()})
+    for iteration in (1, 2):
+        one.update([rollout(iteration)], iteration)
+        two.update([rollout(iteration)], iteration)
+    assert_same_bits(one.state(), two.state())
+
+
+def test_loading_a_state_does_not_tie_two_instances_together(demonstrations, rollout, assert_same_bits):
+    one, two = (build(demonstrations(20), [1.0]) for _ in range(2))
+    one.update([rollout(0)], 0)
+    two.load_state(one.state())
+    kept = {name: value.clone() for name, value in one.state().items()}
+    two.update([rollout(1)], 1)
+    assert_same_bits(one.state(), kept)

@@ -1,0 +1,82 @@
+"""The networks: forward-mode derivative, initial weights, and the trip to NumPy and back."""
+
+import numpy as np
+import torch
+from torch.distributions import Independent, Normal
+from torch.func import functional_call, jvp
+
+from pipeline.algorithms.networks import MLP, PolicyNetwork
+
+
+def test_directional_derivative_equals_forward_mode_autodiff():
+    rng = torch.Generator().manual_seed(0)
+    for hidden in ((7,), (5, 6), (4, 3, 2)):
+        net = MLP(3, hidden, 2, rng).double()
+        x = torch.randn(11, 3, generator=rng, dtype=torch.float64)
+        parameters = dict(net.named_parameters())
+        tangents = {k: torch.randn(p.shape, generator=rng, dtype=torch.float64) for k, p in parameters.items()}
+        _, expected = jvp(lambda p: functional_call(net, p, (x,)), (parameters,), (tangents,))  # noqa: B023
+        result = net.directional_derivative(x, list(tangents.values()))
+        torch.testing.assert_close(result, expected, rtol=1e-10, atol=1e-12)
+
+
+def test_mlp_is_linear_layers_with_tanh_between():
+    net = MLP(1, (1,), 1, torch.Generator())
+    with torch.no_grad():
+        for parameter, value in zip(net.parameters(), (2.0, 0.5, 3.0, -1.0), strict=True):
+            parameter.fill_(value)
+    # 3 tanh(2 * 0.25 + 0.5) - 1 = 3 * 0.7615942 - 1
+    torch.testing.assert_close(net(torch.tensor([[0.25]])), torch.tensor([[3 * 0.7615942 - 1]]))
+
+
+def test_head_starts_small_and_the_seed_decides():
+    one = MLP(16, (64, 64), 4, torch.Generator().manual_seed(7))
+    two = MLP(16, (64, 64), 4, torch.Generator().manual_seed(7))
+    other = MLP(16, (64, 64), 4, torch.Generator().manual_seed(8))
+    assert all(torch.equal(a, b) for a, b in zip(one.parameters(), two.parameters(), strict=True))
+    assert not torch.equal(one.layers[0].weight, other.layers[0].weight)
+    # Uniform in +-1/sqrt(64) = +-0.125, and a tenth of that in the head.
+    assert 0.12 < float(one.layers[1].weight.detach().abs().max()) <= 0.125
+    assert 0.012 < float(one.layers[-1].weight.detach().abs().max()) <= 0.0125
+    assert not one.layers[-1].bias.any()
+
+
+def test_log_prob_equals_torch_distributions(network, batch):
+    policy = network(action_dim=3)
+    observations, actions, log_probs, _ = batch(policy, 40)
+    with torch.no_grad():
+        gaussian = Independent(Normal(policy(observations), policy.log_std.exp()), 1)
+        torch.testing.assert_close(log_probs, gaussian.log_prob(actions + 0), rtol=1e-4, atol=1e-5)
+        shifted = policy.log_prob(policy(observations), actions + 1)
+        torch.testing.assert_close(shifted, gaussian.log_prob(actions + 1), rtol=1e-4, atol=1e-5)
+
+
+def test_exported_policy_has_the_same_mean(network, batch):
+    policy = network(observation_dim=12, action_dim=3, hidden=(64, 64))
+    observations = batch(policy, 100)[0]
+    with torch.no_grad():
+        expected = policy(observations).numpy()
+    result = policy.export().mean(observations.double().numpy())
+    assert result.dtype == np.float32
+    assert np.abs(expected).max() > 0.1
+    np.testing.assert_allclose(result, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_export_is_a_copy(network):
+    policy = network()
+    exported = policy.export()
+    before = {name: value.copy() for name, value in exported.arrays().items()}
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.add_(1.0)
+        policy.input_mean.add_(1.0)
+        policy.input_scale.add_(1.0)
+    for name, value in exported.arrays().items():
+        np.testing.assert_array_equal(value, before[name], err_msg=name)
+
+
+def test_load_is_the_inverse_of_export(network, assert_same_bits):
+    policy = network(seed=1)
+    copy = PolicyNetwork(4, 2, (8, 8), torch.Generator().manual_seed(99))
+    copy.load(policy.export())
+    assert_same_bits(dict(policy.state_dict()), dict(copy.state_dict()))

@@ -1,0 +1,1 @@
+"""Where it runs: processes, messages and sockets; no mathematics."""

@@ -1,0 +1,156 @@
+"""The sockets between the learner and its rollout workers; the only file that knows ZeroMQ.
+
+The learner binds a ROUTER and every worker connects a DEALER, so workers come and go as they like and the learner
+answers each by its name. Both ends are on this machine: the socket lies in a folder that only this user may enter.
+Every wait has a deadline, queues are bounded, and closing drops what was not sent, so nothing here can hang.
+"""
+
+import hashlib
+import os
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import zmq
+
+from workers.messages import MAX_FRAME_BYTES
+
+_QUEUE_LIMIT = 64
+"""Messages waiting per peer and direction; a worker holds two units, so only a defect reaches it."""
+_MAX_PATH = 100
+"""Operating systems allow 104 (macOS) to 108 (Linux) bytes for the path of a socket."""
+_BATCH = 64
+"""Messages that the learner takes in before it looks at anything else."""
+
+
+class EndpointError(RuntimeError):
+    """The folder for the socket cannot be used."""
+
+
+def endpoint_folder(run_path: Path) -> Path:
+    """Return the folder of a run's socket; the same run has the same folder, so a resumed run clears what was left."""
+    digest = hashlib.sha256(str(run_path.absolute()).encode()).hexdigest()[:12]
+    return Path(tempfile.gettempdir()) / f"oodil-{os.getuid()}-{digest}"
+
+
+@contextmanager
+def private_endpoint(run_path: Path) -> Iterator[str]:
+    """Make the folder of a run's socket, empty and closed to other users, and remove it at the end.
+
+    Raises EndpointError if something else is there, or if the path is too long for a socket.
+    """
+    folder = endpoint_folder(run_path)
+    socket = folder / "learner"
+    if len(os.fsencode(socket)) > _MAX_PATH:
+        raise EndpointError(f"{socket} is too long for a socket; set TMPDIR to a folder with a shorter path")
+    _remove(folder)
+    folder.mkdir(mode=0o700)
+    try:
+        yield f"ipc://{socket}"
+    finally:
+        _remove(folder)
+
+
+def _remove(folder: Path) -> None:
+    try:
+        status = folder.lstat()
+    except FileNotFoundError:
+        return
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
+        raise EndpointError(f"{folder} is not a private folder of this user; remove it or set TMPDIR")
+    shutil.rmtree(folder)
+
+
+class _Socket:
+    def __init__(self, kind: int) -> None:
+        self._context = zmq.Context()
+        self._socket = self._context.socket(kind)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.SNDHWM, _QUEUE_LIMIT)
+        self._socket.setsockopt(zmq.RCVHWM, _QUEUE_LIMIT)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
+
+    def close(self) -> None:
+        """Close at once, dropping what was not sent."""
+        self._context.destroy(linger=0)
+
+
+class Router(_Socket):
+    """The learner's end. One thread uses it; only `wake` may be called from others."""
+
+    def __init__(self, endpoint: str) -> None:
+        super().__init__(zmq.ROUTER)
+        # Without it, what is sent to a worker that is gone disappears without a word.
+        self._socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        self._socket.bind(endpoint)
+        self._wake_reader, self._wake_writer = os.pipe()
+        os.set_blocking(self._wake_reader, False)
+        os.set_blocking(self._wake_writer, False)
+        self._poller = zmq.Poller()
+        self._poller.register(self._socket, zmq.POLLIN)
+        self._poller.register(self._wake_reader, zmq.POLLIN)
+
+    def receive(self, timeout_s: float) -> list[tuple[str, list[bytes]]]:
+        """Wait for messages, `wake` or the deadline; return what is there as (name of the worker, frames)."""
+        self._poller.poll(round(timeout_s * 1000))
+        try:
+            os.read(self._wake_reader, 4096)
+        except BlockingIOError:
+            pass
+        messages: list[tuple[str, list[bytes]]] = []
+        while len(messages) < _BATCH:
+            try:
+                name, *frames = self._socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                break
+            messages.append((name.decode("ascii", "replace"), frames))
+        return messages
+
+    def send(self, worker: str, frames: Sequence[bytes]) -> bool:
+        """Send to a worker; return whether it is there and its queue took it."""
+        try:
+            self._socket.send_multipart([worker.encode(), *frames], zmq.NOBLOCK)
+        except zmq.ZMQError as error:
+            if error.errno in (zmq.EHOSTUNREACH, zmq.EAGAIN):
+                return False
+            raise
+        return True
+
+    def wake(self) -> None:
+        """Let `receive` return now; callable from any thread until the socket is closed."""
+        try:
+            os.write(self._wake_writer, b"\0")
+        except BlockingIOError:
+            pass
+
+    def close(self) -> None:
+        """Close at once, dropping what was not sent."""
+        super().close()
+        os.close(self._wake_reader)
+        os.close(self._wake_writer)
+
+
+class Dealer(_Socket):
+    """A rollout worker's end; it connects again by itself when a learner is replaced."""
+
+    def __init__(self, endpoint: str, name: str) -> None:
+        super().__init__(zmq.DEALER)
+        self._socket.setsockopt(zmq.IDENTITY, name.encode())
+        self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
+        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
+        self._socket.connect(endpoint)
+
+    def receive(self, timeout_s: float) -> list[bytes] | None:
+        """Return the frames of the next message, or None when the deadline passes first."""
+        return self._socket.recv_multipart() if self._socket.poll(round(timeout_s * 1000)) else None
+
+    def send(self, frames: Sequence[bytes]) -> bool:
+        """Send to the learner; return whether the queue took it. What it did not take, nobody waits for any more."""
+        try:
+            self._socket.send_multipart(list(frames), zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True

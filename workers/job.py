@@ -1,0 +1,96 @@
+"""The process of a job, a learner's included: find the stage, run the job, write its artifact."""
+
+import importlib
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from workers.messages import Progress, Silent, Warn, shortened
+from workers.supervisor import Link
+
+if TYPE_CHECKING:
+    # A job's process says that it runs before it loads what it computes with.
+    from pipeline.stage import JobContext, RolloutSource, Run, Stage
+
+DONE, STOPPED = "done", "stopped"
+_REPORT_INTERVAL_S = 0.2
+
+
+class _Context:
+    """A job's view of its process: what it reports goes through the pipe."""
+
+    def __init__(self, link: Link, rollouts: "RolloutSource", checkpoint_interval_s: float) -> None:
+        self.rollouts = rollouts
+        self.checkpoint_interval_s = checkpoint_interval_s
+        self._link = link
+        self._next_report = 0.0
+
+    def progress(self, done: int, total: int, **metrics: float) -> None:
+        """Report progress, but not more often than anybody can read."""
+        now = time.monotonic()
+        if now >= self._next_report or done >= total:
+            self._next_report = now + _REPORT_INTERVAL_S
+            figures = {name: float(value) for name, value in metrics.items()}
+            self._link.send(Progress(int(done), int(total), figures))
+
+    def warn(self, message: str) -> None:
+        """Pass a warning on."""
+        self._link.send(Warn(shortened(message)))
+
+    def should_stop(self) -> bool:
+        """Return whether the parent asked for an end."""
+        return self._link.should_stop()
+
+
+def main(link: Link, run_path: str, stages: str, stage: str, job: str, endpoint: str = "", run_id: str = "") -> str:
+    """Run one job; rollout workers collect for it if there is an endpoint. Returns DONE or STOPPED."""
+    from pipeline.artifacts import RunDirectory
+    from pipeline.config import RunConfig
+    from pipeline.stage import JobStoppedError, Run
+
+    directory = RunDirectory(Path(run_path))
+    config = RunConfig.model_validate_json(directory.config.read_text())
+    module, _, function = stages.partition(":")
+    found: Stage = getattr(importlib.import_module(module), function)(config, stage)
+    with _rollouts(link, endpoint, run_id, config.runtime.unit_timeout_s) as rollouts:
+        context = _Context(link, rollouts, config.runtime.checkpoint_interval_s)
+        try:
+            execute(found, Run(config, directory), job, context)
+        except JobStoppedError:
+            return STOPPED
+    return DONE
+
+
+def execute(stage: "Stage", run: "Run", job: str, context: "JobContext") -> None:
+    """Run a job in this process and write its artifact; its checkpoints go when that is safe on disk."""
+    from pipeline.artifacts import write_artifact
+    from pipeline.versions import library_versions
+
+    files = stage.run_job(run, job, context)
+    write_artifact(run.directory.job(stage.name, job), stage.job_origin(run, job), files, library_versions())
+    stage.checkpoints(run, job).clear()
+
+
+@contextmanager
+def _rollouts(link: Link, endpoint: str, run_id: str, unit_timeout_s: float) -> "Iterator[RolloutSource]":
+    from pipeline.rollout import InlineRollouts
+    from workers.learner import ZmqRollouts
+
+    if not endpoint:
+        yield InlineRollouts()
+        return
+    # The identity of this process is new with every attempt, and so is the learner's incarnation.
+    rollouts = ZmqRollouts(
+        endpoint,
+        run_id,
+        incarnation=link.identity,
+        unit_timeout_s=unit_timeout_s,
+        should_stop=link.should_stop,
+        report_silent=lambda worker: link.send(Silent(worker)),
+    )
+    try:
+        yield rollouts
+    finally:
+        rollouts.close()
