@@ -206,7 +206,7 @@ def _walk(
     config: "RunConfig", directory: "RunDirectory", stages: list["Stage"], workers: int | None, force: str | None
 ) -> None:
     """Bring every stage to its finished artifact, or exit with what went wrong."""
-    from pipeline.versions import versions
+    from pipeline.versions import library_versions
     from terminal import Display
     from workers.engine import LocalEngine
 
@@ -216,7 +216,7 @@ def _walk(
     engine = LocalEngine(workers)
     opened = _as_run(config, directory)
     with lock, Display() as display, _stop_flag(display) as should_stop:
-        _record(directory, "run_started", workers=workers, versions=versions())
+        _record(directory, "run_started", workers=workers, versions=library_versions())
         for stage in stages:
             _bring_up(stage, opened, engine, workers, force == stage.name, display, should_stop)
         _record(directory, "run_finished")
@@ -233,7 +233,7 @@ def _bring_up(
 ) -> None:
     from pipeline.artifacts import remove_artifact, write_artifact
     from pipeline.stage import is_current
-    from pipeline.versions import versions
+    from pipeline.versions import library_versions
 
     origin = stage.origin(opened)
     path = opened.directory.stage(stage.name)
@@ -266,7 +266,7 @@ def _bring_up(
         _give_up(stage.name, outcome, opened.directory)
     files = stage.combine(opened)
     if files is not None:
-        write_artifact(path, origin, files, versions())
+        write_artifact(path, origin, files, library_versions())
     seconds = time.monotonic() - started
     _record(opened.directory, "stage_finished", stage=stage.name, seconds=seconds, workers=workers)
     display.stage_finished(stage.name, seconds)

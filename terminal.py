@@ -90,8 +90,8 @@ class Display:
             case JobDone(job=job):
                 if job in self._bars:
                     self._progress.update(self._bars[job], completed=1, total=1, figures="done")
-            case WorkerRestarted():
-                self.say(f"[yellow]! {event.name}: {event.reason}; started again[/]")
+            case WorkerRestarted(worker=worker, reason=reason):
+                self.say(f"[yellow]! {worker}: {reason}; started again[/]")
 
     def _bar(self, job: str) -> Any:
         if job not in self._bars:

@@ -127,6 +127,8 @@ def write_artifact(
         _sync_folder(path.parent)
     finally:
         _remove(temporary)
+        if replaced.exists() and not path.exists():
+            replaced.rename(path)
     _remove(replaced)
     written = read_artifact(path)
     assert written is not None
@@ -181,10 +183,16 @@ class Checkpoints:
         self.origin = origin
 
     def save(self, step: int, arrays: dict[str, NDArray]) -> None:
-        """Write a checkpoint and drop the oldest."""
-        write_artifact(self.folder / f"{step:09d}", self.origin, {"state.safetensors": encode_arrays(arrays)})
-        for old in self._paths()[:-KEPT_CHECKPOINTS]:
-            remove_artifact(old)
+        """Write a checkpoint, keep the one before, and drop the others.
+
+        Among those dropped are all of another origin and all of a later step: a job that started anew, or from an
+        earlier checkpoint than the newest, would otherwise see its own pushed out by what it left behind.
+        """
+        newest = write_artifact(self.folder / f"{step:09d}", self.origin, {"state.safetensors": encode_arrays(arrays)})
+        own = [path for path in self._paths() if path.name <= newest.path.name and self._is_own(path)]
+        for path in self._paths():
+            if path not in own[-KEPT_CHECKPOINTS:]:
+                remove_artifact(path)
 
     def load(self) -> tuple[dict[str, NDArray] | None, list[str]]:
         """Return the newest sound state of a job with this origin, or None, and a warning for each damaged one."""
@@ -205,6 +213,13 @@ class Checkpoints:
     def clear(self) -> None:
         """Delete all checkpoints: the job is finished."""
         _remove(self.folder)
+
+    def _is_own(self, path: Path) -> bool:
+        try:
+            checkpoint = read_artifact(path)
+        except DamagedArtifactError:
+            return False
+        return checkpoint is not None and checkpoint.fingerprint == fingerprint(self.origin)
 
     def _paths(self) -> list[Path]:
         return sorted(p for p in self.folder.glob("[0-9]*") if p.is_dir()) if self.folder.exists() else []

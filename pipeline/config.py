@@ -124,6 +124,14 @@ class TrainingConfig(_Section):
     torch_threads: PositiveInt = 1
     """Threads of the learner; more do not help networks of this size, and change the bits."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _default_generator(cls, values: Any) -> Any:
+        # Without a kind the fields are those of the default, so that one of them can be overridden alone.
+        if isinstance(values, dict) and isinstance(values.get("generator"), dict):
+            return values | {"generator": {"kind": "trpo"} | values["generator"]}
+        return values
+
     @property
     def steps_per_iteration(self) -> int:
         """Environment steps per iteration."""

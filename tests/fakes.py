@@ -56,7 +56,7 @@ def hopper_units(iteration: int, count: int = NUM_GROUPS, num_steps: int = 20, e
 class FakeStage(Stage):
     """Each iteration it collects and adds up; a job's name says what else happens to it.
 
-    ``raises`` raises in every attempt, ``killed`` kills its own process once, in the middle, and ``waits`` does not end
+    ``raises`` raises in every attempt from its second iteration on, ``killed`` kills its own process once, in the middle, and ``waits`` does not end
     before the file ``go`` is in the run directory.
     """
 
@@ -89,7 +89,7 @@ class FakeStage(Stage):
             note(folder / f"{job}.iterations", str(iteration))
             self.checkpoints(run, job).save(iteration, {"iteration": np.array(iteration), "total": total})
             context.progress(iteration, self.num_iterations, reward=float(total.mean()))
-            if job == "raises" and iteration == 2:
+            if job == "raises" and iteration >= 2:
                 raise ArithmeticError(f"told to, in attempt {len(lines(folder / 'raises.attempts'))}")
             if job == "killed" and iteration == 3 and len(lines(folder / "killed.attempts")) == 1:
                 os.kill(os.getpid(), 9)

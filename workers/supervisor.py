@@ -218,7 +218,9 @@ class Supervisor:
         log = self._logs / f"{self._prefix}-{child.name}.{child.attempt}.log"
         pipe, childs_end = _context.Pipe()
         link = (childs_end, str(log), f"{child.name}.{child.attempt}")
-        process = _context.Process(target=_child_main, args=(*link, child.main, child.arguments), daemon=True)
+        process = _context.Process(
+            target=_child_main, args=(*link, child.main, child.arguments), name=child.name, daemon=True
+        )
         with _environment_of_children():
             process.start()
         childs_end.close()

@@ -28,7 +28,18 @@ INK, MUTED, GRID = "#1c2430", "#6a7383", "#e6e9ee"
 TRANSFERABLE = ("#1f5fa8", "#45b0d8", "#12837a", "#8aa9e8", "#123a63")
 NOT_TRANSFERABLE = ("#cf4f1b", "#f2a63b", "#8c3310", "#ec8577", "#b58a12")
 UNKNOWN = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#4b5563", "#b3a400")
-CLUSTERS = ("#2f7d4f", "#8458b3", "#a8b545", "#c25a9d", "#4b3b73", "#7cc79a", "#8c929c", "#c9a2e0", "#20463a", "#7a5c3e")
+CLUSTERS = (
+    "#2f7d4f",
+    "#8458b3",
+    "#a8b545",
+    "#c25a9d",
+    "#4b3b73",
+    "#7cc79a",
+    "#8c929c",
+    "#c9a2e0",
+    "#20463a",
+    "#7a5c3e",
+)
 MARKERS = (("o", "●"), ("s", "■"), ("^", "▲"), ("D", "◆"), ("v", "▼"), ("P", "✚"))
 """Markers of Matplotlib and the characters that stand for them in a legend."""
 
@@ -113,7 +124,12 @@ def source_looks(transferable: Iterable[bool | None]) -> list[Look]:
 
 def project(features: NDArray[np.float32]) -> tuple[NDArray[np.float64], str] | None:
     """Return (N, 2) points for (N, E) features and the name of the projection; None when there is nothing to see."""
-    if len(features) < 3 or features.size == 0 or not np.isfinite(features).all() or np.ptp(features, axis=0).max() == 0:
+    if (
+        len(features) < 3
+        or features.size == 0
+        or not np.isfinite(features).all()
+        or np.ptp(features, axis=0).max() == 0
+    ):
         return None
     features = features.astype(np.float64)
     # One thread: sums over several would differ in their last bits from run to run, and t-SNE would magnify them.
@@ -199,9 +215,7 @@ def _columns(
         axes.hlines(mine.mean(), i - 0.42, i + 0.42, color=INK, linewidth=1.6, zorder=4)
 
 
-def convergence(
-    histories: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]], colours: dict[int, str]
-) -> str:
+def convergence(histories: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]], colours: dict[int, str]) -> str:
     """Draw one panel per cluster: (M,) environment steps and (M, N_k) scores, as mean and 10 to 90 % band."""
     columns = min(len(histories), 5)
     rows = -(-len(histories) // columns)
@@ -244,7 +258,9 @@ def learning(ours: Curve | None, naive: Curve | None, oracle_return: float | Non
         axes.set_ylim(bottom=min(0, axes.get_ylim()[0]))
         _name_lines(axes, ends)
         _steps_axis(axes, 8)
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}" if abs(value) >= 10 else f"{value:g}"))
+        axes.yaxis.set_major_formatter(
+            FuncFormatter(lambda value, _: f"{value:,.0f}" if abs(value) >= 10 else f"{value:g}")
+        )
         axes.set_xlabel("environment steps")
         axes.set_ylabel("return")
     return svg.getvalue()

@@ -109,7 +109,7 @@ def _collection(results: Results) -> Collection | None:
     counts = np.bincount(source_of, minlength=len(labels))
     looks = figures.source_looks(transferable)
     sources = [
-        Source(str(label) or "unnamed", known, int(number), look)
+        Source(label, known, int(number), look)
         for label, known, number, look in zip(labels, transferable, counts, looks, strict=True)
     ]
     means = [float(np.mean(arrays["returns"][source_of == i])) if counts[i] else np.nan for i in range(len(labels))]
@@ -126,15 +126,17 @@ def _headline(results: Results, collection: Collection | None) -> str:
     if collection is None:
         lead = f"Imitator: {imitator}."
     else:
-        number = _plural(len(collection.transitions), "demonstration")
-        known = collection.labelled
-        lead = f"Imitator: {imitator}. It learns from {number} of {_plural(len(collection.sources), 'source')}"
-        lead += "." if known else ", of which nothing more is known."
+        lead = f"Imitator: {imitator}. It learns from {_plural(len(collection.transitions), 'demonstration')}"
+        lead += f" of {_plural(len(collection.sources), 'source')}." if collection.labelled else "; whose is not known."
     finding = _finding(results)
     return (
         f'<header>\n<p class="kicker">Imitation from demonstrators with other dynamics</p>\n'
         f'<h1>{escape(config.name)}</h1>\n<p class="lead">{lead}</p>\n'
-        + (_legend(collection.sources, counts=True) + _families(collection) if collection and collection.labelled else "")
+        + (
+            _legend(collection.sources, counts=True) + _families(collection)
+            if collection and collection.labelled
+            else ""
+        )
         + (f'<p class="finding">{finding}</p>\n' if finding else "")
         + "</header>"
     )
@@ -148,7 +150,9 @@ def _families(collection: Collection) -> str:
 
 
 def _finding(results: Results) -> str:
-    ours, naive, oracle = (_final(results, stage).get("final_return") for stage in ("imitation", "naive_gail", "oracle"))
+    ours, naive, oracle = (
+        _final(results, stage).get("final_return") for stage in ("imitation", "naive_gail", "oracle")
+    )
     if ours is None:
         return ""
     text = f"The policy learned from weighted demonstrations returns <b>{_return(ours)}</b>"
@@ -157,8 +161,7 @@ def _finding(results: Results) -> str:
         text += f", {ours / naive:.1f} times" if comparable else ", against"
         text += f" the {_return(naive)} of naive GAIL" if comparable else f" {_return(naive)} of naive GAIL"
     if oracle is not None:
-        share = f"; the oracle, which is told what is transferable, reaches {_return(oracle)}"
-        text += share
+        text += f"; the oracle, which is told what is transferable, reaches {_return(oracle)}"
     return text + "."
 
 
@@ -174,13 +177,23 @@ def _cards(results: Results) -> str:
     for stage, name in (("imitation", "ours"), ("naive_gail", "naive GAIL"), ("oracle", "oracle")):
         final = _final(results, stage)
         asked = stage in results.artifacts or stage in results.problems
-        cards.append(_card(f"Final return, {name}", _return(final.get("final_return")), _spread(final) if asked else "not asked for"))
+        cards.append(
+            _card(
+                f"Final return, {name}",
+                _return(final.get("final_return")),
+                _spread(final) if asked else "not asked for",
+            )
+        )
     before, after = scores.get("transferable_share_before"), scores.get("transferable_share")
     share = f'{_percent(before)}<span class="arrow">→</span>{_percent(after)}' if after is not None else None
     cards.append(_card("Transferable share", share, "of what the policy learns from, before and after weighting"))
-    cards.append(_card("AUROC", _number(scores.get("auroc"), 3), "1 if all transferable demonstrations rank above all others"))
+    cards.append(
+        _card("AUROC", _number(scores.get("auroc"), 3), "1 if all transferable demonstrations rank above all others")
+    )
     cards.append(_card("Purity of clusters", _number(diagnostics.get("purity"), 3), _cluster_note(diagnostics)))
-    cards.append(_card("Environment steps", figures.count(sum(env_steps.values())) if env_steps else None, "in all trainings"))
+    cards.append(
+        _card("Environment steps", figures.count(sum(env_steps.values())) if env_steps else None, "in all trainings")
+    )
     cards.append(_card("Time", _duration(sum(seconds.values())) if seconds else None, "of all finished stages"))
     return f'<dl class="cards">\n{"".join(cards)}</dl>'
 
@@ -216,7 +229,9 @@ def _notes(results: Results, collection: Collection | None) -> str:
         seed = results.run.config.seed
         notes.append(f"One seed ({seed}). Returns of adversarial imitation vary a lot from seed to seed; a comparison needs "
                      "five or more. The spreads on this page are between episodes, not between seeds.")  # fmt: skip
-    few = {TITLES[stage]: final["episodes"] for stage, final in trained.items() if final.get("episodes", 99) < FEW_EPISODES}
+    few = {
+        TITLES[stage]: final["episodes"] for stage, final in trained.items() if final.get("episodes", 99) < FEW_EPISODES
+    }
     if few:
         named = ", ".join(f"{title} {number}" for title, number in few.items())
         notes.append(f"Few evaluation episodes ({named}): the mean returns are rough.")
@@ -225,7 +240,8 @@ def _notes(results: Results, collection: Collection | None) -> str:
         named = ", ".join(f"{TITLES[stage]} {figures.count(value or 0)}" for stage, value in steps.items())
         notes.append(f"The final policies were not trained for equally long ({named} environment steps).")
     if collection and any(source.transferable is None for source in collection.sources):
-        notes.append("Not all sources are known to be transferable or not; AUROC and shares cover only what is known.")
+        notes.append("It is not known of every source whether it is transferable; AUROC and transferable share rest on those "
+                     "of which it is.")  # fmt: skip
     stability = results.json("clustering", "diagnostics.json").get("label_stability")
     if stability is not None and stability < UNSTABLE_LABELS:
         notes.append(f"Clusters are unstable: only {_percent(stability)} of the demonstrations keep their cluster when other "
@@ -305,7 +321,9 @@ def _source_table(
     collection: Collection, mean_scores: dict[str, Any], before: NDArray[np.float64], after: NDArray[np.float64]
 ) -> str:
     rows = ""
-    columns = zip(collection.sources, collection.own_returns, collection.shares(before), collection.shares(after), strict=True)
+    columns = zip(
+        collection.sources, collection.own_returns, collection.shares(before), collection.shares(after), strict=True
+    )
     for source, own_return, share_before, share_after in columns:
         known = {True: "yes", False: "no", None: "not known"}[source.transferable]
         cells = (
@@ -368,10 +386,14 @@ def _contingency(results: Results, collection: Collection, diagnostics: dict[str
     contingency: dict[str, list[int]] = diagnostics.get("contingency") or {}
     if not contingency:
         return ""
-    used = [k for k in range(len(next(iter(contingency.values())))) if any(counts[k] for counts in contingency.values())]
+    used = [
+        k for k in range(len(next(iter(contingency.values())))) if any(counts[k] for counts in contingency.values())
+    ]
     rows = ""
     for source in collection.sources:
-        counts = contingency.get(source.label, [0] * (max(used) + 1))
+        if source.label not in contingency:
+            continue
+        counts = contingency[source.label]
         total = max(sum(counts), 1)
         cells = "".join(_heat(counts[k], counts[k] / total) for k in used)
         rows += f"<tr><th>{_name(source)}</th>{cells}</tr>\n"
@@ -403,9 +425,7 @@ def _provenance_section(results: Results) -> str:
         time = _duration(seconds[stage]) if stage in seconds else "–"
         steps = f"{env_steps[stage]:,}" if stage in env_steps else "–"
         made = f"<code>{artifact.sha256}</code>" if artifact else escape(results.problems[stage])
-        rows += (
-            f'<tr><th>{TITLES[stage]}</th><td class="number">{time}</td><td class="number">{steps}</td><td>{made}</td></tr>\n'
-        )
+        rows += f'<tr><th>{TITLES[stage]}</th><td class="number">{time}</td><td class="number">{steps}</td><td>{made}</td></tr>\n'
     head = '<th>stage</th><th class="number">time</th><th class="number">environment steps</th><th>SHA-256 of the artifact</th>'
     stages = f'<div class="scroll"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}</tbody>\n</table></div>'
     config = yaml.safe_dump(run.config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
@@ -426,7 +446,9 @@ def _versions(results: Results) -> str:
             found.setdefault(library, {}).setdefault(version, []).append(TITLES[stage])
     listed = []
     for library, versions in sorted(found.items()):
-        each = [version if len(versions) == 1 else f"{version} ({', '.join(used)})" for version, used in versions.items()]
+        each = [
+            version if len(versions) == 1 else f"{version} ({', '.join(used)})" for version, used in versions.items()
+        ]
         listed.append(f"{escape(library)} {escape(' and '.join(each))}")
     return f"<p>Made with {', '.join(listed)}.</p>" if listed else ""
 
@@ -457,7 +479,7 @@ def _legend(sources: Iterable[Source], counts: bool = False) -> str:
 
 
 def _name(source: Source) -> str:
-    return f'<span class="swatch" style="color:{source.look.colour}">{source.look.glyph}</span>{escape(source.label)}'
+    return f'<span class="swatch" style="color:{source.look.colour}">{source.look.glyph}</span>{escape(source.label or "unnamed")}'
 
 
 def _plural(number: int, noun: str) -> str:
@@ -477,7 +499,7 @@ def _number(value: float | None, digits: int) -> str | None:
 def _percent(share: float | None) -> str:
     if share is None:
         return "–"
-    return f"{100 * share:.1f} %" if share < 0.0995 or share > 0.9905 else f"{100 * share:.0f} %"
+    return f"{100 * share:.1f} %" if 0 < share < 0.0995 or 0.9905 < share < 0.9995 else f"{100 * share:.0f} %"
 
 
 def _duration(seconds: float) -> str:

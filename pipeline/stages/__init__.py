@@ -18,7 +18,9 @@ def stages(config: RunConfig) -> list[Stage]:
 
 def stage_named(config: RunConfig, name: str) -> Stage:
     """Return a stage of the run by its name. Raises LookupError, naming those there are, if there is none."""
-    for stage in stages(config):
+    from pipeline.stages.experts import ExpertsStage
+
+    for stage in (*stages(config), ExpertsStage()):
         if stage.name == name:
             return stage
     raise LookupError(f"no stage {name!r}; this run has {', '.join(stage.name for stage in stages(config))}")

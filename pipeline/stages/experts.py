@@ -14,7 +14,7 @@ from pipeline.evaluation import evaluate
 from pipeline.experts import EXPERT_TRAINING, expert_files, train_expert
 from pipeline.seeding import derive_key
 from pipeline.stage import JobContext, Run, Stage
-from pipeline.versions import versions
+from pipeline.versions import library_versions
 
 RESTARTS = 2
 """Independent trainings per source."""
@@ -90,7 +90,7 @@ class ExpertsStage(Stage):
             source = next(s for s in run.config.demonstrations.sources if s.label == label)
             candidate = run.job_artifact(self.name, choice["job"])
             files = {name: candidate.read(name) for name in candidate.hashes}
-            write_artifact(source.expert, {"expert": label, "sha256": candidate.sha256}, files, versions())
+            write_artifact(source.expert, {"expert": label, "sha256": candidate.sha256}, files, library_versions())
             reached = candidate.json("expert.json")["stochastic"]
             lines.append(
                 f"{label}: return {reached['return_mean']:,.0f} ± {reached['return_std']:,.0f}, "

@@ -27,24 +27,21 @@ SMALL = {"hidden": 16, "warmup_iterations": 30, "joint_iterations": 40, "batch_s
 
 
 def three_dynamics(counts: tuple[int, int, int], seed: int = 0) -> Demonstrations:
-    """Ragged demonstrations of a slow oscillator, a fast one, and a random walk, with random phase and noise."""
+    """Ragged demonstrations of oscillators with three frequencies, each with a random phase and noise."""
     rng = np.random.default_rng(seed)
     states = []
     for source, count in enumerate(counts):
         for _ in range(count):
             t = np.arange(rng.integers(60, 120))
             phase = rng.uniform(0, 2 * np.pi)
-            if source == 2:
-                signal = 0.3 * rng.standard_normal((len(t), 2)).cumsum(axis=0)
-            else:
-                angle = phase + (0.05, 0.6)[source] * t
-                signal = np.stack((np.sin(angle), np.cos(angle)), axis=1)
+            angle = phase + (0.05, 0.25, 0.6)[source] * t
+            signal = np.stack((np.sin(angle), np.cos(angle)), axis=1)
             states.append((signal + 0.02 * rng.standard_normal(signal.shape)).astype(np.float32))
     return Demonstrations(
         observations=np.concatenate(states),
         offsets=np.cumsum([0, *(len(s) for s in states)]).astype(np.int64),
         sources=np.repeat(np.arange(3, dtype=np.int32), counts),
-        source_labels=("slow", "fast", "walk"),
+        source_labels=("slow", "middle", "fast"),
         returns=np.full(sum(counts), np.nan),
     )
 
@@ -120,7 +117,7 @@ def test_diagnostics_by_hand():
     features = np.array([[1, 0], [1, 0.1], [0, 1], [0.1, 1], [0, 1], [0.9, 0]], np.float32)
     labels = np.array([0, 0, 3, 3, 3, 0], np.int32)
     report = diagnostics(Labelling(labels, features, stability=0.75), demonstrations, num_clusters=4)
-    assert report["contingency"] == {"slow": [2, 0, 0, 0], "fast": [0, 0, 0, 3], "walk": [1, 0, 0, 0]}
+    assert report["contingency"] == {"slow": [2, 0, 0, 0], "middle": [0, 0, 0, 3], "fast": [1, 0, 0, 0]}
     assert report["purity"] == pytest.approx(5 / 6)
     assert report["cluster_sizes"] == [3, 0, 0, 3]
     assert (report["num_clusters"], report["non_empty_clusters"], report["label_stability"]) == (4, 2, 0.75)
@@ -269,7 +266,7 @@ def test_the_files_of_the_stage(make_run):
     report = artifact.json("diagnostics.json")
     assert sum(report["cluster_sizes"]) == 20
     assert report["shortened_subtrajectories"] == 0
-    assert set(report["contingency"]) == {"slow", "fast", "walk"}
+    assert set(report["contingency"]) == {"slow", "middle", "fast"}
 
 
 def test_another_seed_gives_another_encoder(make_run):

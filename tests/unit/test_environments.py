@@ -208,8 +208,7 @@ def test_gravity_accelerates_a_hopper_in_the_air(gravity):
     before = fall()
     env.do_simulation(np.zeros(3), 50)
     elapsed = 50 * env.model.opt.timestep
-    # The joints are damped against the air, hence not to the last digit.
-    assert (fall() - before) / elapsed == pytest.approx(-gravity, rel=1e-2)
+    assert (fall() - before) / elapsed == pytest.approx(-gravity, rel=1e-3)
 
 
 def foot_friction(friction):

@@ -1,0 +1,264 @@
+"""Children that are killed, hang or are orphaned, with real processes and real signals."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.fakes import STAGES, FakeStage, fake_run, lines, wait_until
+from workers.channels import endpoint_folder
+from workers.engine import Event, JobFailed, LocalEngine, WorkerRestarted
+from workers.messages import Progress
+from workers.supervisor import Died, Ended, Link, Restarts, Said, Started, Supervisor
+from workers.supervisor import Event as ChildEvent
+
+pytestmark = pytest.mark.timeout(120)
+ROOT = Path(__file__).parents[2]
+
+
+def obedient(link: Link) -> str:
+    """Say the process id, then wait for the stop."""
+    link.send(Progress(os.getpid(), 0, {}))
+    while not link.should_stop():
+        time.sleep(0.01)
+    return "stopped"
+
+
+def deaf(link: Link) -> str:
+    """Ignore everything that can be ignored."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    link.send(Progress(os.getpid(), 0, {}))
+    while True:
+        time.sleep(1)
+
+
+def broken(link: Link) -> str:
+    """Raise something that no encoding can carry as it is."""
+    raise LookupError("lone surrogate \ud800, attempt " + link.identity)
+
+
+def describes_itself(link: Link) -> str:
+    """Return what a child starts with."""
+    print("to the log", flush=True)
+    os.write(2, b"to the log as well\n")
+    return f"{os.environ['OMP_NUM_THREADS']} {signal.getsignal(signal.SIGINT) == signal.SIG_IGN}"
+
+
+def vanishes(link: Link) -> str:
+    """End without a word, as a library that calls exit() would."""
+    os._exit(0)
+
+
+def poll_until(supervisor: Supervisor, kind: type, timeout_s: float = 30.0) -> ChildEvent:
+    """Return the first event of a kind."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        for event in supervisor.poll(0.1):
+            if isinstance(event, kind):
+                return event
+    raise TimeoutError(f"no {kind.__name__} within {timeout_s:g} s")
+
+
+def started(supervisor: Supervisor) -> int:
+    """Return the process id that a child says when it is up."""
+    said = poll_until(supervisor, Said)
+    assert isinstance(said, Said) and isinstance(said.report, Progress)
+    return said.report.done
+
+
+def is_alive(pid: int) -> bool:
+    """Return whether a process is there and not a zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_a_child_computes_with_one_thread_and_writes_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    with Supervisor(tmp_path, "stage") as supervisor:
+        supervisor.start("child", describes_itself, {}, Restarts(0, 0.0))
+        assert poll_until(supervisor, Ended) == Ended("child", "1 True")
+    assert (os.environ["OMP_NUM_THREADS"], os.environ.get("MKL_NUM_THREADS")) == ("7", None)
+    assert (tmp_path / "stage-child.1.log").read_text() == "to the log\nto the log as well\n"
+
+
+def test_a_killed_child_is_started_again_until_its_restarts_are_used(tmp_path: Path) -> None:
+    with Supervisor(tmp_path, "stage") as supervisor:
+        supervisor.start("child", obedient, {}, Restarts(1, 0.0))
+        os.kill(started(supervisor), signal.SIGKILL)
+        died = poll_until(supervisor, Died)
+        assert isinstance(died, Died) and died.restarts and died.reason.startswith("killed by SIGKILL")
+        os.kill(started(supervisor), signal.SIGSEGV)
+        died = poll_until(supervisor, Died)
+        assert isinstance(died, Died) and not died.restarts and died.reason.startswith("killed by SIGSEGV")
+        assert supervisor.poll(0.0) == []
+
+
+@pytest.mark.parametrize(("main", "reason"), [(broken, "lone surrogate \\ud800, attempt child.1"), (vanishes, "code 0")])
+def test_the_reason_of_a_failure_is_told(tmp_path: Path, main: object, reason: str) -> None:
+    with Supervisor(tmp_path, "stage") as supervisor:
+        supervisor.start("child", main, {}, Restarts(0, 0.0))  # type: ignore[arg-type]
+        died = poll_until(supervisor, Died)
+        assert isinstance(died, Died) and reason in died.reason
+
+
+def test_pauses_double_up_to_a_limit() -> None:
+    restarts = Restarts(8, 0.5)
+    assert [restarts.next_delay() for _ in range(9)] == [0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0, 10.0, None]
+
+
+def test_ctrl_c_does_not_reach_children_and_a_stop_does(tmp_path: Path) -> None:
+    with Supervisor(tmp_path, "stage") as supervisor:
+        supervisor.start("child", obedient, {}, Restarts(0, 0.0))
+        os.kill(started(supervisor), signal.SIGINT)
+        assert supervisor.stop("child")
+        assert poll_until(supervisor, Ended) == Ended("child", "stopped")
+
+
+def test_a_child_that_waits_for_its_restart_is_stopped_at_once(tmp_path: Path) -> None:
+    with Supervisor(tmp_path, "stage") as supervisor:
+        supervisor.start("child", broken, {}, Restarts(5, 1000.0))
+        poll_until(supervisor, Died)
+        assert not supervisor.stop("child")
+        assert supervisor.poll(0.0) == []
+
+
+@pytest.mark.parametrize("main", [obedient, deaf])
+@pytest.mark.parametrize("is_suspended", [False, True])
+def test_closing_ends_every_child_and_can_be_repeated(tmp_path: Path, main: object, is_suspended: bool) -> None:
+    supervisor = Supervisor(tmp_path, "stage")
+    supervisor.start("child", main, {}, Restarts(5, 0.0))  # type: ignore[arg-type]
+    pid = started(supervisor)
+    if is_suspended:
+        os.kill(pid, signal.SIGSTOP)
+    supervisor.close(grace_s=0.2)
+    supervisor.close(grace_s=0.2)
+    assert not is_alive(pid)
+    assert not multiprocessing.active_children()
+
+
+def test_only_the_named_attempt_is_killed(tmp_path: Path) -> None:
+    with Supervisor(tmp_path, "stage") as supervisor:
+        supervisor.start("child", obedient, {}, Restarts(5, 0.0))
+        os.kill(started(supervisor), signal.SIGKILL)
+        second = started(supervisor)
+        supervisor.kill("child.1")
+        supervisor.poll(0.1)
+        assert is_alive(second)
+        supervisor.kill("child.2")
+        assert isinstance(poll_until(supervisor, Died), Died)
+        assert poll_until(supervisor, Started) == Started("child", 3)
+
+
+def test_a_job_that_is_killed_continues_from_its_checkpoint(tmp_path: Path) -> None:
+    run = fake_run(tmp_path)
+    events: list[Event] = []
+    outcome = LocalEngine(1, STAGES).run_jobs(FakeStage(False), run, ["killed", "a"], events.append, lambda: False)
+    assert outcome.done == ["killed", "a"] and not outcome.failed
+    failures = [event for event in events if isinstance(event, JobFailed)]
+    assert [(event.job, event.will_retry) for event in failures] == [("killed", True)]
+    assert "SIGKILL" in failures[0].reason
+    assert lines(tmp_path / "killed.began_at") == ["0", "3"]
+    assert run.job_artifact("jobs", "killed").sha256 == run.job_artifact("jobs", "a").sha256
+
+
+def test_a_killed_learner_finds_its_workers_again(tmp_path: Path) -> None:
+    run = fake_run(tmp_path)
+    events: list[Event] = []
+    outcome = LocalEngine(2, STAGES).run_jobs(FakeStage(True), run, ["killed", "a"], events.append, lambda: False)
+    assert outcome.done == ["killed", "a"] and not outcome.failed
+    assert not [event for event in events if isinstance(event, WorkerRestarted)]
+    assert lines(tmp_path / "killed.began_at") == ["0", "3"]
+    assert run.job_artifact("learner", "killed").sha256 == run.job_artifact("learner", "a").sha256
+
+
+def test_workers_that_keep_dying_fail_the_stage(tmp_path: Path) -> None:
+    run = fake_run(tmp_path, max_worker_restarts=2)
+    stop = threading.Event()
+    killer = threading.Thread(target=_kill_workers, args=(stop,))
+    killer.start()
+    try:
+        outcome = LocalEngine(1, STAGES).run_jobs(FakeStage(True), run, ["a", "b"], lambda event: None, lambda: False)
+    finally:
+        stop.set()
+        killer.join()
+    assert not outcome.done and outcome.not_run == ["b"] and not outcome.stopped
+    assert "max_worker_restarts" in outcome.failed["a"] and "SIGKILL" in outcome.failed["a"]
+    assert not multiprocessing.active_children()
+
+
+def _kill_workers(stop: threading.Event) -> None:
+    while not stop.wait(0.05):
+        for child in multiprocessing.active_children():
+            if child.name.startswith("rollout-worker-") and child.pid is not None:
+                os.kill(child.pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("distributed", [False, True])
+def test_nothing_is_left_when_the_orchestrator_is_killed(tmp_path: Path, distributed: bool) -> None:
+    run = fake_run(tmp_path)
+    code = f"""
+from pathlib import Path
+from tests.fakes import FakeStage, STAGES, fake_run
+from workers.engine import LocalEngine
+
+if __name__ == "__main__":
+    run = fake_run(Path({str(tmp_path)!r}))
+    LocalEngine(2, STAGES).run_jobs(FakeStage({distributed}), run, ["waits", "a"], print, lambda: False)
+"""
+    script = tmp_path / "orchestrator.py"
+    script.write_text(code)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    parent = subprocess.Popen([sys.executable, str(script)], env=environment, start_new_session=True)
+    try:
+        wait_until(lambda: len(lines(tmp_path / "waits.iterations")) >= 2)
+        assert len(_session(parent.pid)) >= 3
+        assert endpoint_folder(tmp_path).exists() == distributed
+    finally:
+        parent.kill()
+        parent.wait()
+    wait_until(lambda: not _session(parent.pid))
+
+    (tmp_path / "go").touch()
+    stage = FakeStage(distributed)
+    outcome = LocalEngine(1, STAGES).run_jobs(stage, run, ["waits"], lambda event: None, lambda: False)
+    assert outcome.done == ["waits"]
+    assert lines(tmp_path / "waits.began_at") == ["0", "2"]
+    assert not endpoint_folder(tmp_path).exists()
+
+
+def _session(leader: int) -> list[int]:
+    """Return the processes of a session that are alive."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and is_alive(int(entry.name)):
+            try:
+                if os.getsid(int(entry.name)) == leader:
+                    found.append(int(entry.name))
+            except ProcessLookupError:
+                pass
+    return found
+
+
+def test_an_exception_in_the_orchestrator_ends_everything_at_once(tmp_path: Path) -> None:
+    run = fake_run(tmp_path)
+
+    def interrupt() -> bool:
+        if len(lines(tmp_path / "waits.iterations")) >= 2:
+            raise KeyboardInterrupt
+        return False
+
+    with pytest.raises(KeyboardInterrupt):
+        LocalEngine(2, STAGES).run_jobs(FakeStage(True), run, ["waits"], lambda event: None, interrupt)
+    assert not multiprocessing.active_children()
+    assert not endpoint_folder(tmp_path).exists()
+    (pid,) = lines(tmp_path / "waits.attempts")
+    assert not is_alive(int(pid))

@@ -1,0 +1,208 @@
+"""The learner: interrupted equals uninterrupted, the true reward stays out, and what enters each part."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import safetensors.numpy
+import torch
+
+from pipeline.algorithms.gail import AdversarialReward
+from pipeline.algorithms.learner import EnvReward, Learner
+from pipeline.artifacts import encode_arrays
+from pipeline.config import GailConfig, PpoConfig, TrpoConfig, ValueConfig
+from pipeline.rollout import Unit, collect
+from pipeline.seeding import derive_key
+
+TRPO, PPO = TrpoConfig(), PpoConfig(minibatch_size=40, epochs=2, learning_rate=1e-3)
+
+
+def build(demonstrations=None, **settings):
+    """Make a learner of two groups of two Hoppers; it imitates where demonstrations are given."""
+    config = GailConfig(
+        total_steps=480,
+        num_groups=2,
+        simulators_per_group=2,
+        steps_per_rollout=24,
+        policy_hidden=(8, 8),
+        value=ValueConfig(hidden=(8,), minibatch_size=20),
+        **settings,
+    )
+    weights = np.array([1.0, 0.3])
+    reward = AdversarialReward(demonstrations, weights, config.discriminator, 0) if demonstrations else EnvReward()
+    return Learner(12, 3, config, reward, root_seed=0)
+
+
+def train(learner, first, last, snapshots=(None, None), dynamics=()):
+    """Run iterations [first, last) as a job does, without lag; return the snapshots of the groups."""
+    snapshots = list(snapshots)
+    for iteration in range(first, last):
+        policy = learner.behaviour_policy()
+        results = [
+            collect(
+                Unit(
+                    iteration,
+                    group,
+                    "oodil/Hopper-v0",
+                    dynamics,
+                    learner.config.simulators_per_group,
+                    learner.config.steps_per_rollout,
+                    iteration,
+                    policy,
+                    derive_key(learner.root_seed, "rollout", group, iteration),
+                    snapshots[group],
+                )
+            )
+            for group in range(learner.config.num_groups)
+        ]
+        snapshots = [result.snapshot for result in results]
+        learner.update([result.rollout for result in results], iteration)
+    return snapshots
+
+
+def through_a_file(state):
+    """Write and read a state as a checkpoint does."""
+    content = encode_arrays({name: value.numpy() for name, value in state.items()})
+    return {name: torch.from_numpy(value) for name, value in safetensors.numpy.load(content).items()}
+
+
+@pytest.fixture
+def shown(demonstrations):
+    return demonstrations(40, 25, observation_dim=12)
+
+
+@pytest.mark.parametrize("imitate", [False, True], ids=["env_reward", "gail"])
+@pytest.mark.parametrize("normalise", [False, True], ids=["raw", "normalised"])
+@pytest.mark.parametrize("generator", [TRPO, PPO], ids=["trpo", "ppo"])
+def test_interrupted_equals_uninterrupted(shown, assert_same_bits, generator, normalise, imitate):
+    settings = {
+        "demonstrations": shown if imitate else None,
+        "generator": generator,
+        "normalise_observations": normalise,
+        "scale_rewards": normalise,
+        "initial_log_std": -0.5,
+    }
+    whole = build(**settings)
+    snapshots = train(whole, 0, 2)
+    saved = through_a_file(whole.state())
+    train(whole, 2, 4, snapshots)
+
+    resumed = build(**settings)
+    train(resumed, 0, 1)  # whatever it was before must not matter
+    resumed.load_state(saved)
+    train(resumed, 2, 4, snapshots)
+    assert_same_bits(resumed.state(), whole.state())
+    assert_same_bits(resumed.behaviour_policy(), whole.behaviour_policy())
+    assert any(not torch.equal(value, saved[name]) for name, value in whole.state().items())
+
+
+@pytest.mark.parametrize("generator", [TRPO, PPO], ids=["trpo", "ppo"])
+def test_a_fresh_state_can_be_saved_and_loaded(shown, assert_same_bits, generator):
+    one, two = (build(shown, generator=generator) for _ in range(2))
+    two.load_state(through_a_file(one.state()))
+    train(one, 0, 1)
+    train(two, 0, 1)
+    assert_same_bits(one.state(), two.state())
+
+
+def test_every_tensor_of_the_state_is_needed_and_restored(shown, assert_same_bits):
+    """No entry is forgotten: a state of other numbers comes back as it is."""
+    learner = build(shown, generator=PPO, normalise_observations=True)
+    train(learner, 0, 2)
+    other = {name: torch.full_like(value, 0.5) for name, value in learner.state().items()}
+    learner.load_state(through_a_file(other))
+    assert_same_bits(dict(learner.state()), other)
+    parts = {name.split("/")[0] for name in other}
+    assert parts == {"moments", "generator", "value_optimiser", "reward_model", "policy", "value"}
+
+
+@pytest.mark.parametrize("generator", [TRPO, PPO], ids=["trpo", "ppo"])
+def test_imitation_without_a_true_reward_gives_the_same_bits(shown, assert_same_bits, generator):
+    """The fifth invariant, in an environment that really pays NaN."""
+    plain, poisoned = (build(shown, generator=generator) for _ in range(2))
+    train(plain, 0, 3)
+    train(poisoned, 0, 3, dynamics=(("forward_reward_weight", math.nan),))
+    assert_same_bits(poisoned.state(), plain.state())
+    assert all(torch.isfinite(value).all() for value in poisoned.state().values())
+
+
+def test_an_expert_does_learn_from_the_true_reward(assert_same_bits):
+    plain, poisoned = build(), build()
+    train(plain, 0, 1)
+    train(poisoned, 0, 1, dynamics=(("healthy_reward", 5.0),))
+    assert any(not torch.equal(plain.state()[name], poisoned.state()[name]) for name in plain.state())
+
+
+def test_the_order_of_the_groups_is_part_of_the_update(shown, rollout):
+    rollouts = [rollout(seed, observation_dim=12) for seed in (0, 1)]
+    rollouts = [replace(r, actions=np.concatenate((r.actions, r.actions[..., :1]), axis=2)) for r in rollouts]
+    one, two = build(shown), build(shown)
+    one.update(rollouts, 0)
+    two.update(rollouts[::-1], 0)
+    assert any(one.state()[name].numpy().tobytes() != two.state()[name].numpy().tobytes() for name in one.state())
+
+
+def test_the_discriminator_steps_after_the_reward_is_read(shown, rollout):
+    """The policy learns from the discriminator as it was when the rollouts were collected."""
+    made = rollout(0, observation_dim=12)
+    made = replace(made, actions=np.concatenate((made.actions, made.actions[..., :1]), axis=2))
+    learner = build(shown)
+    expected = float(learner.reward_model.rewards([made]).mean())
+    assert learner.update([made], 0)["reward"] == pytest.approx(expected, rel=1e-6)
+    assert float(learner.reward_model.rewards([made]).mean()) != pytest.approx(expected, rel=1e-6)
+
+
+def test_values_of_next_states(shown, rollout):
+    """Within an episode it is the next row's value; at its end and at the last row that of the state before reset."""
+    first, second = (rollout(seed, observation_dim=12, num_steps=8) for seed in (0, 1))
+    rollouts = []
+    for r in (first, second):
+        ended = r.terminated | r.truncated
+        successors = r.next_observations.copy()
+        successors[:-1][~ended[:-1]] = r.observations[1:][~ended[:-1]]
+        rollouts.append(replace(r, next_observations=successors))
+    learner = build(shown, normalise_observations=True)
+    flat = torch.from_numpy(np.concatenate([r.observations for r in rollouts], axis=1)).flatten(0, 1)
+    learner._track(flat)
+    ended = np.concatenate([r.terminated | r.truncated for r in rollouts], axis=1)
+    values, next_values = learner._values(learner.policy.normalise(flat), rollouts, ended)
+    successors = torch.from_numpy(np.concatenate([r.next_observations for r in rollouts], axis=1))
+    with torch.no_grad():
+        expected = learner.value(learner.policy.normalise(successors.flatten(0, 1))).view(8, 6).numpy()
+        present = learner.value(learner.policy.normalise(flat)).view(8, 6).numpy()
+    np.testing.assert_allclose(next_values, expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(values, present, rtol=1e-5, atol=1e-6)
+
+
+def test_normaliser_is_the_mean_and_deviation_of_all_observations(shown):
+    rng = np.random.default_rng(0)
+    parts = [torch.from_numpy(rng.normal(3.0, 2.0, (50, 12)).astype(np.float32)) for _ in range(3)]
+    learner = build(shown, normalise_observations=True)
+    for part in parts:
+        learner._track(part)
+    together = torch.cat(parts).double().numpy()
+    np.testing.assert_allclose(learner.policy.input_mean.numpy(), together.mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(learner.policy.input_scale.numpy(), 1 / together.std(axis=0), rtol=1e-5)
+
+
+def test_a_constant_observation_does_not_blow_up(shown):
+    learner = build(shown, normalise_observations=True)
+    learner._track(torch.full((50, 12), 3.0))
+    assert torch.isfinite(learner.policy.normalise(torch.full((1, 12), 3.5))).all()
+
+
+def test_without_normalisation_the_policy_sees_raw_observations(shown):
+    learner = build(shown)
+    train(learner, 0, 1)
+    assert not learner.policy.input_mean.any()
+    assert (learner.policy.input_scale == 1).all()
+
+
+def test_sent_policies_do_not_follow_the_learner(shown):
+    learner = build(shown, normalise_observations=True)
+    sent = learner.behaviour_policy()
+    before = {name: value.copy() for name, value in sent.arrays().items()}
+    train(learner, 0, 1)
+    for name, value in sent.arrays().items():
+        np.testing.assert_array_equal(value, before[name], err_msg=name)
