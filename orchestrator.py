@@ -163,7 +163,7 @@ def collect_demos(
         with _bad_input():
             directory = _open_run_directory(scratch, config)
         _walk(config, directory, [ExpertsStage()], workers, None)
-        ExpertsStage().export(_as_run(config, directory))
+        print("\n".join(ExpertsStage().export(_as_run(config, directory))))
     with _bad_input():
         _check_inputs(config)
         directory = _open_run_directory(scratch, config)
@@ -402,9 +402,9 @@ def _trained_policy(opened: "Run", stage: str) -> Any:
 def _describe(opened: "Run") -> dict[str, Any]:
     """Return the state of every stage and the results known so far, as JSON values."""
     from pipeline.artifacts import DamagedArtifactError, read_artifact
-    from pipeline.results import stage_seconds, summary
+    from pipeline.results import Results, summary
 
-    seconds = stage_seconds(opened)
+    seconds = Results(opened).seconds()
     described = {}
     for stage in _stages(opened.config):
         entry: dict[str, Any] = {"state": "pending", "sha256": None}
@@ -413,7 +413,7 @@ def _describe(opened: "Run") -> dict[str, Any]:
             if artifact is not None:
                 artifact.verify()
                 entry = {"state": "done", "sha256": artifact.sha256}
-            elif stage.name in seconds:
+            elif opened.directory.has_begun(stage.name):
                 entry["state"] = "partial"
         except DamagedArtifactError as error:
             entry = {"state": "damaged", "sha256": None, "reason": str(error)}

@@ -57,7 +57,7 @@ class Display:
 
     def say(self, message: str) -> None:
         """Print one line above the live part."""
-        self._console.print(message, highlight=False)
+        self._console.print(message, highlight=False, soft_wrap=True)
 
     def reused(self, stage: str) -> None:
         """Say that a finished stage is taken as it is."""

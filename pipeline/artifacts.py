@@ -258,6 +258,10 @@ class RunDirectory:
         """The artifact of a job; a stage with one job of its own name has no other artifact."""
         return self.stage(stage) if job == stage else self.path / "jobs" / stage / job
 
+    def has_begun(self, stage: str) -> bool:
+        """Return whether there are finished jobs or checkpoints of a stage."""
+        return any((self.path / kind / stage).exists() for kind in ("jobs", "checkpoints"))
+
     def checkpoints(self, stage: str, job: str) -> Path:
         """The checkpoints of a job."""
         return self.path / "checkpoints" / stage / job

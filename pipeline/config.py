@@ -20,7 +20,7 @@ class ConfigError(ValueError):
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 class EnvironmentConfig(_Section):
@@ -107,8 +107,9 @@ class TrainingConfig(_Section):
     """Decay of generalised advantage estimation."""
     policy_hidden: Hidden = (64, 64)
     """Widths of the policy's hidden layers."""
-    normalise_observations: bool = False
-    """Standardise what policy and value see, by running statistics; the discriminator always sees raw states."""
+    normalise_observations: bool = True
+    """Standardise what policy and value see, by the weighted demonstrations' statistics (for experts, by running
+    ones). The discriminator always sees raw states."""
     scale_rewards: bool = False
     """Multiply rewards by 1 - discount, so that values are of order one."""
     initial_log_std: float = 0.0
@@ -232,7 +233,9 @@ class ClusteringConfig(_Section):
     @model_validator(mode="before")
     @classmethod
     def _preset(cls, values: Any) -> Any:
-        if isinstance(values, dict) and values.get("preset") == "official":
+        if isinstance(values, dict) and "preset" in values:
+            if values["preset"] != "official":
+                raise ValueError(f"preset is {values['preset']!r}; the only one is 'official'")
             return OFFICIAL_CLUSTERING | {key: value for key, value in values.items() if key != "preset"}
         return values
 
@@ -360,7 +363,10 @@ def _override(values: dict[str, Any], override: str) -> None:
         values = values.setdefault(parent, {})
         if not isinstance(values, dict):
             raise ConfigError(f"override {override!r}: {parent} is not a section")
-    values[last] = yaml.safe_load(text)
+    try:
+        values[last] = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"override {override!r}: the value is not valid YAML: {error}") from error
 
 
 def _describe(problem: Any) -> str:

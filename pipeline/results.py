@@ -49,7 +49,7 @@ class Results:
         """Return the object in a JSON file of a stage; empty when it cannot be had."""
         return self._read(stage, name, Artifact.json)
 
-    def arrays(self, stage: str, name: str) -> dict[str, NDArray]:
+    def arrays(self, stage: str, name: str) -> dict[str, NDArray[Any]]:
         """Return the arrays in a file of a stage; empty when they cannot be had."""
         return self._read(stage, name, Artifact.arrays)
 
@@ -65,11 +65,11 @@ class Results:
 
     def env_steps(self) -> dict[str, int]:
         """Return the environment steps that each finished training took."""
-        steps = {stage: self.json(stage, "evaluation.json").get("env_steps") for stage in STAGES[3:]}
+        steps: dict[str, Any] = {stage: self.json(stage, "evaluation.json").get("env_steps") for stage in STAGES[3:]}
         history = self.arrays("transferability", "history.safetensors")
         jobs = [int(value[-1]) for name, value in history.items() if name.endswith("/env_steps") and len(value)]
         steps["transferability"] = sum(jobs) or None
-        return {stage: int(steps[stage]) for stage in STAGES if steps.get(stage) is not None}
+        return {stage: steps[stage] for stage in STAGES if steps.get(stage) is not None}
 
     def seconds(self) -> dict[str, float]:
         """Return how long each stage took when it was last finished."""

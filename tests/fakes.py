@@ -34,7 +34,9 @@ def hopper_policy(seed: int = 0) -> GaussianPolicy:
     )
 
 
-def hopper_units(iteration: int, count: int = NUM_GROUPS, num_steps: int = 20, env_id: str = "oodil/Hopper-v0") -> list[Unit]:
+def hopper_units(
+    iteration: int, count: int = NUM_GROUPS, num_steps: int = 20, env_id: str = "oodil/Hopper-v0"
+) -> list[Unit]:
     """Return the units of an iteration in which every group starts afresh."""
     return [
         Unit(

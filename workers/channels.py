@@ -11,7 +11,7 @@ import shutil
 import stat
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import zmq
@@ -96,10 +96,8 @@ class Router(_Socket):
     def receive(self, timeout_s: float) -> list[tuple[str, list[bytes]]]:
         """Wait for messages, `wake` or the deadline; return what is there as (name of the worker, frames)."""
         self._poller.poll(round(timeout_s * 1000))
-        try:
+        with suppress(BlockingIOError):
             os.read(self._wake_reader, 4096)
-        except BlockingIOError:
-            pass
         messages: list[tuple[str, list[bytes]]] = []
         while len(messages) < _BATCH:
             try:
@@ -121,10 +119,8 @@ class Router(_Socket):
 
     def wake(self) -> None:
         """Let `receive` return now; callable from any thread until the socket is closed."""
-        try:
+        with suppress(BlockingIOError):
             os.write(self._wake_writer, b"\0")
-        except BlockingIOError:
-            pass
 
     def close(self) -> None:
         """Close at once, dropping what was not sent."""

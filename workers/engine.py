@@ -259,9 +259,7 @@ class _InlineContext:
         self._on_event(JobWarning(self._job, message))
 
 
-def _run_inline(
-    stage: Stage, run: Run, jobs: list[str], on_event: OnEvent, should_stop: Callable[[], bool]
-) -> Outcome:
+def _run_inline(stage: Stage, run: Run, jobs: list[str], on_event: OnEvent, should_stop: Callable[[], bool]) -> Outcome:
     outcome = Outcome()
     for job in jobs:
         is_done = False

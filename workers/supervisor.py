@@ -15,7 +15,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import connection, resource_tracker
 from multiprocessing.context import SpawnProcess
@@ -105,10 +105,8 @@ class _Process:
     last_words: Finished | Failed | None = None
 
     def say(self, report: Report) -> None:
-        try:
+        with suppress(OSError):  # It may be gone; `poll` will say so.
             self.pipe.send_bytes(encode_report(report))
-        except OSError:
-            pass  # It is gone; `poll` will say so.
 
     def close(self) -> None:
         self.process.join()

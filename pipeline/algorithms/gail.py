@@ -40,9 +40,16 @@ class AdversarialReward:
         self.root_seed = root_seed
         self._starts = demonstrations.transition_starts()
         self._cumulative = np.cumsum(np.repeat(weights, demonstrations.lengths - 1))
+        self._state_weights = np.repeat(weights, demonstrations.lengths)
         self._observations = demonstrations.observations
         rng = torch.Generator().manual_seed(torch_seed(derive_key(root_seed, "discriminator", "initial")))
         self.discriminator = Discriminator(demonstrations.observation_dim, config, rng)
+
+    def state_moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return mean and standard deviation (S,) of the demonstrations' states as they are weighted."""
+        mean = np.average(self._observations, axis=0, weights=self._state_weights)
+        variance = np.average(np.square(self._observations - mean), axis=0, weights=self._state_weights)
+        return mean, np.sqrt(variance)
 
     @torch.no_grad()
     def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:

@@ -23,11 +23,15 @@ from pipeline.policy import GaussianPolicy
 from pipeline.rollout import Rollout
 from pipeline.seeding import derive_key, torch_seed
 
-Arrays = dict[str, NDArray]
+SMALLEST_DEVIATION = 1e-4
+"""A state dimension that varies less than this is not blown up any further."""
 
 
 class RewardModel(Protocol):
     """Where an iteration's rewards come from."""
+
+    def state_moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return mean and standard deviation (S,) of the states ahead, or None to learn them from rollouts."""
 
     def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:
         """Return (T, G) rewards."""
@@ -44,6 +48,10 @@ class RewardModel(Protocol):
 
 class EnvReward:
     """The environment's own reward: for training experts, and for nothing else."""
+
+    def state_moments(self) -> None:
+        """Nothing is known beforehand."""
+        return None
 
     def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:
         """Return the (T, G) rewards of the environment."""
@@ -86,6 +94,10 @@ class Learner:
             if config.generator.kind == "trpo"
             else Ppo(self.policy, config.generator)
         )
+        moments = reward_model.state_moments()
+        self._tracks_moments = config.normalise_observations and moments is None
+        if config.normalise_observations and moments is not None:
+            self._normalise_by(*(torch.from_numpy(moment) for moment in moments))
         self._moments = torch.zeros(1 + 2 * observation_dim, dtype=torch.float64)
 
     def behaviour_policy(self) -> GaussianPolicy:
@@ -104,7 +116,7 @@ class Learner:
         # Scaled by 1 - discount, values are averages of rewards: of order one, whatever the horizon.
         rewards = self.reward_model.rewards(rollouts) * np.float32(self._reward_scale)
         flat = observations.flatten(0, 1)
-        if config.normalise_observations:
+        if self._tracks_moments:
             self._track(flat)
         inputs = self.policy.normalise(flat)
         values, next_values = self._values(inputs, rollouts, terminated | truncated)
@@ -145,9 +157,11 @@ class Learner:
         self._moments += torch.cat((torch.tensor([float(len(wide))]), wide.sum(0), wide.square().sum(0)))
         count, (total, squares) = self._moments[0], self._moments[1:].view(2, -1)
         mean = total / count
-        deviation = (squares / count - mean.square()).clamp_min(1e-8).sqrt()
+        self._normalise_by(mean, (squares / count - mean.square()).clamp_min(0).sqrt())
+
+    def _normalise_by(self, mean: Tensor, deviation: Tensor) -> None:
         self.policy.input_mean.copy_(mean)
-        self.policy.input_scale.copy_(1 / deviation)
+        self.policy.input_scale.copy_(1 / deviation.clamp_min(SMALLEST_DEVIATION))
 
     def state(self) -> dict[str, Tensor]:
         """Return everything that later iterations depend on, as named tensors."""

@@ -1,8 +1,8 @@
 """The figures of the report, each as one SVG element. They hold no text of the user, so the page brings the legends.
 
-Letters: N demonstrations, K clusters, E embedding, M points of a curve. Sources keep one colour and one marker throughout:
-blues can be reproduced by the imitator, oranges cannot, so the eye sees at once whether the two were told apart. The
-two families differ in blue against yellow, which every common form of colour blindness leaves intact.
+Sources keep one colour and one marker throughout: blues can be reproduced by the imitator, oranges cannot, so the eye
+sees at once whether the two were told apart. Blue and orange stay apart in every common form of colour blindness.
+Letters: N demonstrations, K clusters, E embedding, M points of a curve.
 """
 
 import io
@@ -43,7 +43,7 @@ CLUSTERS = (
 MARKERS = (("o", "●"), ("s", "■"), ("^", "▲"), ("D", "◆"), ("v", "▼"), ("P", "✚"))
 """Markers of Matplotlib and the characters that stand for them in a legend."""
 
-FEWEST_FOR_TSNE, MOST_FOR_TSNE = 30, 4000
+FEWEST_FOR_TSNE, MOST_FOR_TSNE = 30, 2500
 PERPLEXITY = 8.0
 """Below the size of the smallest sources that matter: the paper's rarest have ten demonstrations, and the usual 30
 shrinks them to a dot."""
@@ -171,7 +171,7 @@ def embedding(
 
 
 def transferability(scores: NDArray[np.float64], sources: NDArray[np.int32], looks: list[Look]) -> str:
-    """Draw the (N,) scores from the highest to the lowest, coloured by source (N,); beside it, one column per source."""
+    """Draw the (N,) scores from the highest to the lowest, coloured by source (N,); beside it a column per source."""
     order = np.argsort(-scores, kind="stable")
     rank = np.empty(len(scores))
     rank[order] = np.arange(1, len(scores) + 1)
@@ -233,7 +233,7 @@ def convergence(histories: dict[int, tuple[NDArray[np.float64], NDArray[np.float
             axes.set_title(f"cluster {k}", fontweight="bold")
             axes.set_title(f"N = {scores.shape[1]}", loc="right", fontsize=7.5, color=MUTED)
             _score_axis(axes, highest, note=False)
-            _steps_axis(axes, 3)
+            _steps_axis(axes, 4)
         figure.supxlabel("environment steps of the cluster's job", fontsize=8.5, color=MUTED)
         panels[0, 0].set_ylabel("transferability")
     return svg.getvalue()

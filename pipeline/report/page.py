@@ -73,7 +73,7 @@ class Collection:
 
     def shares(self, mass: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return each source's share of a mass (N,)."""
-        return np.bincount(self.source_of, mass, minlength=len(self.sources)) / mass.sum()
+        return np.asarray(np.bincount(self.source_of, mass, minlength=len(self.sources)) / mass.sum())
 
 
 def render(run: Run) -> str:
@@ -227,8 +227,10 @@ def _notes(results: Results, collection: Collection | None) -> str:
     trained = {stage: final for stage, final in finals.items() if final}
     if trained:
         seed = results.run.config.seed
-        notes.append(f"One seed ({seed}). Returns of adversarial imitation vary a lot from seed to seed; a comparison needs "
-                     "five or more. The spreads on this page are between episodes, not between seeds.")  # fmt: skip
+        notes.append(
+            f"One seed ({seed}). Returns of adversarial imitation vary a lot from seed to seed; a comparison needs "
+            "five or more. The spreads on this page are between episodes, not between seeds."
+        )
     few = {
         TITLES[stage]: final["episodes"] for stage, final in trained.items() if final.get("episodes", 99) < FEW_EPISODES
     }
@@ -240,12 +242,16 @@ def _notes(results: Results, collection: Collection | None) -> str:
         named = ", ".join(f"{TITLES[stage]} {figures.count(value or 0)}" for stage, value in steps.items())
         notes.append(f"The final policies were not trained for equally long ({named} environment steps).")
     if collection and any(source.transferable is None for source in collection.sources):
-        notes.append("It is not known of every source whether it is transferable; AUROC and transferable share rest on those "
-                     "of which it is.")  # fmt: skip
+        notes.append(
+            "It is not known of every source whether it is transferable, so there is no AUROC and no transferable share "
+            "to judge the scores by."
+        )
     stability = results.json("clustering", "diagnostics.json").get("label_stability")
     if stability is not None and stability < UNSTABLE_LABELS:
-        notes.append(f"Clusters are unstable: only {_percent(stability)} of the demonstrations keep their cluster when other "
-                     "parts of them are drawn.")  # fmt: skip
+        notes.append(
+            f"Clusters are unstable: only {_percent(stability)} of the demonstrations keep theirs when other parts of "
+            "them are drawn."
+        )
     if not notes:
         return ""
     items = "".join(f"<li>{note}</li>\n" for note in notes)
@@ -262,8 +268,8 @@ def _learning_section(results: Results) -> str:
         return _section("The policy", _missing("No policy has been trained yet."))
     episodes = results.run.config.imitation.gail.evaluation_episodes
     caption = (
-        f"True return of the deterministic policy in the imitator's environment, {_plural(episodes, 'episode')} at each point; "
-        "the bands are one standard deviation of the episodes. The return is never used for learning. "
+        f"True return of the deterministic policy in the imitator's environment, {_plural(episodes, 'episode')} at "
+        "each point; the bands are one standard deviation of the episodes. The return is never used for learning. "
     )
     if oracle is not None:
         caption += "Dashed: the final return of the oracle, which imitates only what is known to be transferable."
@@ -284,12 +290,12 @@ def _transferability_section(results: Results, collection: Collection | None) ->
         return _section("Transferability", _missing("The transferability of the demonstrations is not known yet."))
     summary = results.json("transferability", "summary.json")
     before = collection.transitions.astype(np.float64)
-    after = arrays["weights"] * collection.transitions
+    after = before * arrays["weights"]
     sharpening = summary.get("sharpening")
     parts = [
         _caption(
-            "Each mark is one demonstration: how far the discriminator of its cluster's job takes it for something that the "
-            "imitator itself does. A demonstration is drawn for imitation in proportion to "
+            "Each mark is one demonstration: how far the discriminator of its cluster's job takes it for something "
+            "that the imitator itself does. A demonstration is drawn for imitation in proportion to "
             + ("this value." if sharpening in (None, 1) else f"this value to the power {sharpening:g}.")
         ),
         _legend(collection.sources),
@@ -308,13 +314,15 @@ def _transferability_section(results: Results, collection: Collection | None) ->
 def _mass_bars(collection: Collection, before: NDArray[np.float64], after: NDArray[np.float64]) -> str:
     rows = ""
     for title, mass in (("unweighted", before), ("weighted", after)):
-        segments = "".join(
-            f'<span style="flex:{share:.5f};background:{source.look.colour};color:{source.look.text}" title="{escape(source.label)}: {_percent(share)}">'
-            f"{_percent(share) if share >= 0.05 else ''}</span>"
-            for source, share in zip(collection.sources, collection.shares(mass), strict=True)
-        )
+        segments = "".join(map(_segment, collection.sources, collection.shares(mass)))
         rows += f'<div>{title}</div><div class="bar">{segments}</div>\n'
     return f'<div class="mass">\n{rows}</div>'
+
+
+def _segment(source: Source, share: float) -> str:
+    style = f"flex:{share:.5f};background:{source.look.colour};color:{source.look.text}"
+    shown = _percent(share) if share >= 0.05 else ""
+    return f'<span style="{style}" title="{escape(source.label)}: {_percent(share)}">{shown}</span>'
 
 
 def _source_table(
@@ -334,7 +342,7 @@ def _source_table(
         rows += f"<tr><th>{_name(source)}</th><td>{known}</td>{numbers}</tr>\n"
     titles = ("demonstrations", "return in its own dynamics", "mean transferability", "share before", "share after")
     head = "<th>source</th><th>transferable</th>" + "".join(f'<th class="number">{title}</th>' for title in titles)
-    return f'<div class="scroll"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}</tbody>\n</table></div>'
+    return _table(head, rows)
 
 
 def _convergence(results: Results, collection: Collection) -> str:
@@ -403,10 +411,7 @@ def _contingency(results: Results, collection: Collection, diagnostics: dict[str
         cells = "".join(f"<td>{mean.mean():.3f}</td>" if len(mean) else "<td>–</td>" for mean in means)
         rows += f'<tr class="mean"><th>mean transferability</th>{cells}</tr>\n'
     head = "<th>cluster</th>" + "".join(f"<th>{k}</th>" for k in used)
-    return (
-        "<h3>Which source went into which cluster</h3>\n"
-        f'<div class="scroll"><table class="heat">\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}</tbody>\n</table></div>'
-    )
+    return "<h3>Which source went into which cluster</h3>\n" + _table(head, rows, "heat")
 
 
 def _heat(count: int, share: float) -> str:
@@ -425,13 +430,16 @@ def _provenance_section(results: Results) -> str:
         time = _duration(seconds[stage]) if stage in seconds else "–"
         steps = f"{env_steps[stage]:,}" if stage in env_steps else "–"
         made = f"<code>{artifact.sha256}</code>" if artifact else escape(results.problems[stage])
-        rows += f'<tr><th>{TITLES[stage]}</th><td class="number">{time}</td><td class="number">{steps}</td><td>{made}</td></tr>\n'
-    head = '<th>stage</th><th class="number">time</th><th class="number">environment steps</th><th>SHA-256 of the artifact</th>'
-    stages = f'<div class="scroll"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}</tbody>\n</table></div>'
+        numbers = f'<td class="number">{time}</td><td class="number">{steps}</td>'
+        rows += f"<tr><th>{TITLES[stage]}</th>{numbers}<td>{made}</td></tr>\n"
+    head = (
+        '<th>stage</th><th class="number">time</th><th class="number">environment steps</th>'
+        "<th>SHA-256 of the artifact</th>"
+    )
     config = yaml.safe_dump(run.config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     parts = [
         f"<p>Root seed {run.config.seed}; every random stream is derived from it.</p>",
-        stages,
+        _table(head, rows),
         _versions(results),
         f"<details><summary>Resolved configuration</summary><pre>{escape(config)}</pre></details>",
     ]
@@ -465,6 +473,11 @@ def _figure(svg: str, description: str) -> str:
     return f"<figure>{accessible}</figure>"
 
 
+def _table(head: str, rows: str, kind: str = "plain") -> str:
+    body = f"<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}</tbody>"
+    return f'<div class="scroll"><table class="{kind}">\n{body}\n</table></div>'
+
+
 def _caption(text: str) -> str:
     return f'<p class="caption">{text}</p>'
 
@@ -479,7 +492,8 @@ def _legend(sources: Iterable[Source], counts: bool = False) -> str:
 
 
 def _name(source: Source) -> str:
-    return f'<span class="swatch" style="color:{source.look.colour}">{source.look.glyph}</span>{escape(source.label or "unnamed")}'
+    swatch = f'<span class="swatch" style="color:{source.look.colour}">{source.look.glyph}</span>'
+    return swatch + escape(source.label or "unnamed")
 
 
 def _plural(number: int, noun: str) -> str:

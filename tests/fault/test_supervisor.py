@@ -102,7 +102,9 @@ def test_a_killed_child_is_started_again_until_its_restarts_are_used(tmp_path: P
         assert supervisor.poll(0.0) == []
 
 
-@pytest.mark.parametrize(("main", "reason"), [(broken, "lone surrogate \\ud800, attempt child.1"), (vanishes, "code 0")])
+@pytest.mark.parametrize(
+    ("main", "reason"), [(broken, "lone surrogate \\ud800, attempt child.1"), (vanishes, "code 0")]
+)
 def test_the_reason_of_a_failure_is_told(tmp_path: Path, main: object, reason: str) -> None:
     with Supervisor(tmp_path, "stage") as supervisor:
         supervisor.start("child", main, {}, Restarts(0, 0.0))  # type: ignore[arg-type]

@@ -40,7 +40,10 @@ def test_frames_arrive_whole_and_answers_find_their_worker(endpoint: str) -> Non
     try:
         for dealer, name in ((one, b"1"), (two, b"2")):
             assert dealer.send([name, b"", bytes(1_000_000)])
-        assert sorted(receive(router, 2)) == [("one", [b"1", b"", bytes(1_000_000)]), ("two", [b"2", b"", bytes(1_000_000)])]
+        assert sorted(receive(router, 2)) == [
+            ("one", [b"1", b"", bytes(1_000_000)]),
+            ("two", [b"2", b"", bytes(1_000_000)]),
+        ]
         assert router.send("two", [b"for two"]) and router.send("one", [b"for one"])
         assert (one.receive(30.0), two.receive(30.0)) == ([b"for one"], [b"for two"])
         assert one.receive(0.0) is None

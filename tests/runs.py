@@ -1,0 +1,107 @@
+"""Whole runs in processes of their own, as a user starts them, for the tests that kill them."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+ROOT = Path(__file__).parents[1]
+MICRO = ROOT / "tests" / "micro.yaml"
+PATIENCE_S = 120.0
+
+
+class LiveRun:
+    """A run that goes on in the background, in a session of its own so that all of its processes can be found."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, str(ROOT / "orchestrator.py"), *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+
+    def finish(self) -> tuple[int, str]:
+        """Wait for the end and return exit code and output."""
+        output, _ = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, output
+
+    def kill_group(self) -> None:
+        """SIGKILL every process of the run at once."""
+        for member in self.members():
+            member.kill()
+        self.process.communicate(timeout=PATIENCE_S)
+
+    def members(self) -> list[psutil.Process]:
+        """Return the living processes of the run's session."""
+        found = []
+        for process in psutil.process_iter():
+            try:
+                if os.getsid(process.pid) == self.process.pid and process.status() != psutil.STATUS_ZOMBIE:
+                    found.append(process)
+            except (OSError, psutil.Error):
+                continue
+        return found
+
+    def child(self, log_prefix: str) -> psutil.Process:
+        """Wait for the child whose log begins with ``log_prefix``, such as ``imitation-rollout-worker-0``."""
+
+        def find() -> psutil.Process | None:
+            for member in self.members():
+                try:
+                    if any(Path(file.path).name.startswith(log_prefix) for file in member.open_files()):
+                        return member
+                except psutil.Error:
+                    continue
+            return None
+
+        return wait_for(find, f"a child with a log named {log_prefix}*")
+
+
+def wait_for(find: Callable[[], Any], what: str) -> Any:
+    """Return the first thing that ``find`` finds within the patience of a test."""
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        found = find()
+        if found:
+            return found
+        time.sleep(0.02)
+    raise TimeoutError(f"no {what} within {PATIENCE_S:g} s")
+
+
+def has_checkpoint(run_dir: Path, stage: str, job: str, at_least: int) -> Callable[[], bool]:
+    """Return a function that says whether a job has got as far as an iteration."""
+    folder = run_dir / "checkpoints" / stage / job
+    return lambda: any(int(p.name) >= at_least for p in folder.glob("[0-9]*"))
+
+
+def run(*arguments: str) -> str:
+    """Run a command to its end; it must succeed. Returns its output."""
+    code, output = LiveRun(*arguments).finish()
+    assert code == 0, output
+    return output
+
+
+def artifacts(run_dir: Path) -> dict[str, str]:
+    """Return the SHA-256 of every stage, all of which must be done."""
+    stages = json.loads(run("status", str(run_dir), "--json"))["stages"]
+    assert {entry["state"] for entry in stages.values()} == {"done"}, stages
+    return {name: entry["sha256"] for name, entry in stages.items()}
+
+
+def nothing_left(live: LiveRun) -> None:
+    """Assert that no process of a run is left after a short while."""
+    wait_for(lambda: not live.members(), "end of all processes")
+
+
+def interrupt(live: LiveRun, number: signal.Signals) -> None:
+    """Signal the whole group, as a terminal does."""
+    os.killpg(live.process.pid, number)

@@ -1,0 +1,173 @@
+"""Who imports whom, and what must appear nowhere: read from the sources, not from what happens to be loaded."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PROCESS_MODULES = {"multiprocessing", "subprocess", "concurrent", "joblib"}
+PROCESS_CALLS = {"os.fork", "os.forkpty", "os.system", "os.popen", "pty.fork", "pty.spawn"}
+PROCESS_PREFIXES = ("os.exec", "os.spawn", "os.posix_spawn", "torch.multiprocessing")
+UNSAFE_MODULES = {"pickle", "_pickle", "cPickle", "dill", "cloudpickle", "jsonpickle", "msgpack_numpy", "shelve", "marshal"}
+UNSAFE_CALLS = {"torch.load", "torch.save", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "np.load", "numpy.load"}
+UNSAFE_METHODS = {"send_pyobj", "recv_pyobj"}
+CONVERTERS: set[str] = set()
+"""The one file that may read foreign pickles, once there is one."""
+
+
+def sources() -> list[str]:
+    """Return all source files of the program, relative to the root."""
+    found = [path for folder in ("pipeline", "workers", "examples") for path in (ROOT / folder).rglob("*.py")]
+    return sorted(str(path.relative_to(ROOT)) for path in [*found, *ROOT.glob("*.py")])
+
+
+def parse(name: str) -> ast.Module:
+    return ast.parse((ROOT / name).read_text(), name)
+
+
+def imported(tree: ast.Module) -> Iterator[str]:
+    """Yield the full name of everything that is imported anywhere in a file; no file imports relatively."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, "relative import"
+            assert node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def called(tree: ast.Module) -> Iterator[tuple[str, ast.Call]]:
+    """Yield each call with the dotted name of what is called."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            yield ast.unparse(node.func), node
+
+
+def packages(tree: ast.Module) -> set[str]:
+    return {name.split(".")[0] for name in imported(tree)}
+
+
+def forbidden_imports(name: str, tree: ast.Module) -> set[str]:
+    """Return what a file imports against the order orchestrator -> workers -> pipeline."""
+    above = {"pipeline": {"workers", "orchestrator", "terminal"}, "workers": {"orchestrator", "terminal"}}
+    return packages(tree) & above.get(name.split("/")[0], {"orchestrator"})
+
+
+def starts_processes(tree: ast.Module) -> set[str]:
+    """Return by what a file could start processes."""
+    names = {*imported(tree), *(name for name, _ in called(tree))}
+    return (packages(tree) & PROCESS_MODULES) | {
+        name for name in names if name in PROCESS_CALLS or name.startswith(PROCESS_PREFIXES)
+    }
+
+
+def unpickles(tree: ast.Module) -> set[str]:
+    """Return by what a file could turn bytes into code."""
+    found = packages(tree) & UNSAFE_MODULES
+    found |= set(imported(tree)) & UNSAFE_CALLS
+    for name, call in called(tree):
+        if name in UNSAFE_CALLS - {"np.load", "numpy.load"} or name.split(".")[-1] in UNSAFE_METHODS:
+            found.add(name)
+        for keyword in call.keywords:
+            if keyword.arg == "allow_pickle" and not (
+                isinstance(keyword.value, ast.Constant) and keyword.value.value is False
+            ):
+                found.add(f"{name}(allow_pickle)")
+            if keyword.arg == "weights_only":
+                found.add(f"{name}(weights_only)")
+    return found
+
+
+def test_the_program_is_found():
+    assert {"orchestrator.py", "pipeline/config.py", "pipeline/algorithms/trpo.py"} <= set(sources())
+    assert any(name.startswith("workers/") for name in sources())
+
+
+@pytest.mark.parametrize("name", sources())
+def test_imports_run_one_way(name):
+    assert not forbidden_imports(name, parse(name))
+
+
+def test_one_file_knows_zeromq():
+    assert [name for name in sources() if "zmq" in packages(parse(name))] == ["workers/channels.py"]
+
+
+def test_one_file_starts_processes():
+    assert [name for name in sources() if starts_processes(parse(name))] == ["workers/supervisor.py"]
+
+
+@pytest.mark.parametrize("name", sources())
+def test_nothing_is_unpickled(name):
+    if name not in CONVERTERS:
+        assert not unpickles(parse(name))
+
+
+def test_the_bottom_stays_at_the_bottom():
+    """Configuration, data, files and seeds know nothing of what is built on them."""
+    for name in ("config", "data", "artifacts", "seeding", "policy"):
+        assert "pipeline" not in packages(parse(f"pipeline/{name}.py")), name
+    for path in (ROOT / "pipeline" / "algorithms").rglob("*.py"):
+        names = set(imported(parse(str(path.relative_to(ROOT)))))
+        assert not {name for name in names if name.startswith(("pipeline.stage", "pipeline.report"))}, path
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "check"),
+    [
+        ("pipeline/a.py", "def f():\n    import workers.engine", forbidden_imports),
+        ("pipeline/stages/a.py", "from orchestrator import main", forbidden_imports),
+        ("workers/a.py", "import orchestrator", forbidden_imports),
+        ("examples/a.py", "import orchestrator", forbidden_imports),
+        ("a.py", "from multiprocessing import Process", starts_processes),
+        ("a.py", "import concurrent.futures", starts_processes),
+        ("a.py", "import os\nos.fork()", starts_processes),
+        ("a.py", "from os import fork", starts_processes),
+        ("a.py", "import os\nos.execv('a', [])", starts_processes),
+        ("a.py", "import torch\ntorch.multiprocessing.spawn(f)", starts_processes),
+        ("a.py", "import pickle", unpickles),
+        ("a.py", "from cloudpickle import loads", unpickles),
+        ("a.py", "import torch\ntorch.load('a')", unpickles),
+        ("a.py", "from torch import load", unpickles),
+        ("a.py", "import yaml\nyaml.load('a', yaml.Loader)", unpickles),
+        ("a.py", "import numpy\nnumpy.load('a', allow_pickle=True)", unpickles),
+        ("a.py", "import numpy\nnumpy.load('a', allow_pickle=trust)", unpickles),
+        ("a.py", "socket.recv_pyobj()", unpickles),
+    ],
+)
+def test_the_checks_notice(file, text, check):
+    tree = ast.parse(text)
+    assert check(file, tree) if check is forbidden_imports else check(tree)
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("workers/a.py", "from pipeline.rollout import collect"),
+        ("workers/a.py", "import os\nos.getpid()"),
+        ("pipeline/a.py", "import numpy as np\nnp.load('a', allow_pickle=False)"),
+        ("pipeline/a.py", "import yaml\nyaml.safe_load('a')"),
+    ],
+)
+def test_the_checks_let_pass(file, text):
+    tree = ast.parse(text)
+    assert not forbidden_imports(file, tree)
+    assert not starts_processes(tree)
+    assert not unpickles(tree)
+
+
+def loaded_by(module: str) -> set[str]:
+    """Return the packages that importing a module loads in a fresh interpreter."""
+    probe = f"import sys, {module}; print(*{{name.split('.')[0] for name in sys.modules}})"
+    result = subprocess.run([sys.executable, "-c", probe], check=True, cwd=ROOT, capture_output=True, text=True)
+    return set(result.stdout.split())
+
+
+@pytest.mark.parametrize("module", ["pipeline.rollout", "workers.rollout"])
+def test_a_rollout_worker_starts_without_torch(module):
+    loaded = loaded_by(module)
+    assert "mujoco" in loaded
+    assert not loaded & {"torch", "sklearn", "matplotlib"}

@@ -1,0 +1,230 @@
+"""The configuration: every shipped file loads, and every mistake is answered by one line that helps."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from pydantic import BaseModel, ValidationError
+
+import pipeline.config
+from pipeline.config import (
+    OFFICIAL_CLUSTERING,
+    ClusteringConfig,
+    ConfigError,
+    PpoConfig,
+    TrainingConfig,
+    TrpoConfig,
+    load_config,
+    parse_config,
+)
+
+ROOT = Path(__file__).parents[2]
+SHIPPED = sorted((ROOT / "configs").glob("*.yaml"))
+SOURCE = {"label": "heavy", "dynamics": {"gravity": 15.0}, "expert": "experts/heavy", "count": 3}
+
+
+def values(**changes):
+    return {
+        "name": "test",
+        "environment": {"id": "oodil/Hopper-v0", "dynamics": {"gravity": 12.0}},
+        "demonstrations": {"sources": [SOURCE]},
+        "transferability": {"gail": {"total_steps": 1000}},
+        "imitation": {"gail": {"total_steps": 2000}},
+    } | changes
+
+
+@pytest.fixture
+def write(tmp_path):
+    def to_file(content):
+        path = tmp_path / "config.yaml"
+        path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+        return path
+
+    return to_file
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
+def test_every_shipped_configuration_loads(path):
+    assert load_config(path).name == path.stem
+
+
+def test_a_minimal_file_gets_the_defaults(write, tmp_path):
+    config = load_config(write(values()))
+    assert config.seed == 0
+    assert config.clustering == ClusteringConfig()
+    assert config.imitation.gail.generator == TrpoConfig()
+    assert config.demonstrations.sources[0].expert == tmp_path / "experts" / "heavy"
+
+
+def test_a_resolved_configuration_reads_back_as_it_is(write):
+    config = load_config(write(values(clustering={"preset": "official"}, baselines=["naive_gail"])))
+    assert parse_config(json.loads(config.model_dump_json()), "resolved") == config
+
+
+def test_overrides_reach_every_depth_and_are_typed(write):
+    overrides = [
+        "seed=7",
+        "imitation.gail.policy_hidden=[32, 16]",
+        "imitation.gail.generator.kind=ppo",
+        "imitation.gail.generator.learning_rate=1e-3",
+        "transferability.gail.generator.max_kl=0.02",
+        "clustering.num_clusters=1",
+        "runtime.workers=0",
+        "environment.dynamics.gravity=9.8",
+        "name=a-b",
+    ]
+    config = load_config(write(values()), overrides)
+    assert config.seed == 7
+    assert config.imitation.gail.policy_hidden == (32, 16)
+    assert config.imitation.gail.generator == PpoConfig(learning_rate=1e-3)
+    assert config.transferability.gail.generator == TrpoConfig(max_kl=0.02)
+    assert (config.clustering.num_clusters, config.runtime.workers, config.name) == (1, 0, "a-b")
+    assert config.environment.dynamics == {"gravity": 9.8}
+
+
+def test_an_override_wins_over_the_file_and_the_last_one_wins(write):
+    assert load_config(write(values(seed=1)), ["seed=2", "seed=3"]).seed == 3
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("seed", "'seed' is not of the form key=value"),
+        ("=3", "'=3' is not of the form key=value"),
+        ("seed.deeper=3", "seed is not a section"),
+        ("demonstrations.sources.count=3", "sources is not a section"),
+        ("seed=[1", r"'seed=\[1': the value is not valid YAML"),
+        ("sed=3", "unknown key 'sed'; did you mean 'seed'"),
+        ("runtime.wokers=3", "unknown key 'runtime.wokers'; did you mean 'workers'"),
+    ],
+)
+def test_bad_overrides_are_refused(write, override, message):
+    with pytest.raises(ConfigError, match=message):
+        load_config(write(values(seed=1)), [override])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"enviroment": {}}, "config: unknown key 'enviroment'; did you mean 'environment'"),
+        ({"clustering": {"num_cluster": 3}}, "unknown key 'clustering.num_cluster'; did you mean 'num_clusters'"),
+        (
+            {"imitation": {"gail": {"total_steps": 1, "gamma": 0.9}}},
+            r"unknown key 'imitation\.gail\.gamma'; (did you mean|valid keys: .*discount)",
+        ),
+        (
+            {"imitation": {"gail": {"total_steps": 1, "generator": {"kind": "ppo", "clp": 0.1}}}},
+            r"unknown key 'imitation\.gail\.generator\.clp'; did you mean 'clip'",
+        ),
+        (
+            {"demonstrations": {"sources": [SOURCE | {"cuont": 3}]}},
+            r"unknown key 'demonstrations\.sources\.0\.cuont'; did you mean 'count'",
+        ),
+        ({"zzz": 1}, "unknown key 'zzz'; valid keys: .*baselines.*seed"),
+        ({"seed": "many"}, "seed: Input should be a valid integer.*got 'many'"),
+        ({"seed": -1}, "seed: .*greater than or equal to 0, got -1"),
+        ({"name": "a b"}, "name: .*got 'a b'"),
+        ({"name": "../up"}, "name: .*got '../up'"),
+        ({"imitation": {"gail": {}}}, "imitation.gail.total_steps: required, but missing"),
+        ({"imitation": {"gail": {"total_steps": 0}}}, "imitation.gail.total_steps: .*greater than 0, got 0"),
+        ({"imitation": {"gail": {"total_steps": 9, "lag": 2}}}, "imitation.gail.lag: .*0 or 1, got 2"),
+        ({"imitation": {"gail": {"total_steps": 9, "discount": 1.5}}}, "discount: .*less than or equal to 1, got 1.5"),
+        ({"imitation": {"gail": {"total_steps": 9, "policy_hidden": []}}}, "policy_hidden: .*at least 1"),
+        ({"imitation": {"gail": {"total_steps": 9, "initial_log_std": float("nan")}}}, "finite number, got nan"),
+        ({"imitation": {"gail": {"total_steps": 9, "generator": {"kind": "sac"}}}}, "generator: .*sac.*'trpo', 'ppo'"),
+        ({"environment": {"dynamics": {"gravity": "low"}}}, "environment.dynamics.gravity: .*number.*got 'low'"),
+        ({"environment": {"dynamics": {"gravity": float("inf")}}}, "environment.dynamics.gravity: .*finite.*got inf"),
+        ({"clustering": {"preset": "offical"}}, "clustering: preset is 'offical'; the only one is 'official'"),
+        ({"clustering": {"update_order": "both"}}, "clustering.update_order: .*step_first.*got 'both'"),
+        ({"clustering": []}, "clustering: "),
+        ({"demonstrations": {}}, "demonstrations: give either file or sources"),
+        ({"demonstrations": {"file": "a", "sources": [SOURCE]}}, "demonstrations: give either file or sources"),
+        ({"demonstrations": {"sources": [SOURCE, SOURCE]}}, "two sources have the same label"),
+        ({"baselines": ["oracle"]}, "the oracle needs sources that are marked transferable"),
+        ({"baselines": ["bc"]}, "baselines.0: .*naive_gail.*got 'bc'"),
+        ({"runtime": {"workers": -1}}, "runtime.workers: .*greater than or equal to 0, got -1"),
+    ],
+)
+def test_mistakes_are_named(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        parse_config(values(**changes), "config")
+
+
+def test_every_mistake_gets_its_own_line():
+    with pytest.raises(ConfigError) as caught:
+        parse_config(values(seed="x", sed=1, name="a b"), "file.yaml")
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 3
+    assert all(line.startswith("file.yaml: ") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "expected a mapping of keys, found NoneType"),
+        ("[1, 2]", "expected a mapping of keys, found list"),
+        ("a: [1", "not valid YAML"),
+        ("!!python/object/apply:os.getcwd []", "not valid YAML"),
+    ],
+)
+def test_files_that_are_no_configuration_are_named(write, content, message):
+    with pytest.raises(ConfigError, match=rf"config\.yaml: .*{message}"):
+        load_config(write(content))
+
+
+def test_binary_and_missing_files_are_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"gone\.yaml: No such file"):
+        load_config(tmp_path / "gone.yaml")
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x01")
+    with pytest.raises(ConfigError, match=r"binary\.yaml: not valid YAML"):
+        load_config(tmp_path / "binary.yaml")
+
+
+def test_the_official_preset_can_be_changed_in_parts():
+    official = ClusteringConfig.model_validate({"preset": "official"})
+    changed = ClusteringConfig.model_validate({"preset": "official", "label_draws": 3})
+    for key, value in OFFICIAL_CLUSTERING.items():
+        assert getattr(official, key) == value
+        assert getattr(official, key) != getattr(ClusteringConfig(), key), "the preset repeats the default"
+    assert changed == official.model_copy(update={"label_draws": 3})
+
+
+def test_a_configuration_cannot_be_changed():
+    config = parse_config(values(), "config")
+    with pytest.raises(ValidationError, match="frozen"):
+        config.seed = 3
+
+
+def test_iterations_round_up():
+    config = TrainingConfig(total_steps=1001, num_groups=2, simulators_per_group=5, steps_per_rollout=10)
+    assert (config.steps_per_iteration, config.num_iterations) == (100, 11)
+    assert config.model_copy(update={"total_steps": 1000}).num_iterations == 10
+
+
+def test_every_field_is_explained():
+    sections = [
+        value
+        for name, value in vars(pipeline.config).items()
+        if isinstance(value, type) and issubclass(value, BaseModel) and name.endswith("Config")
+    ]
+    assert len(sections) > 10
+    silent = [
+        f"{section.__name__}.{name}"
+        for section in sections
+        for name, field in section.model_fields.items()
+        if not field.description and name != "kind"
+    ]
+    assert not silent
+
+
+def test_reading_a_configuration_loads_no_heavy_library():
+    """``--help`` and a wrong key answer at once."""
+    probe = (
+        "import sys, pipeline.config\n"
+        "heavy = {'torch', 'mujoco', 'gymnasium', 'sklearn', 'scipy', 'zmq', 'matplotlib'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", probe], check=True, cwd=ROOT)
