@@ -194,7 +194,7 @@ class ClusteringConfig(_Section):
     """Contrastive clustering, Algorithm 1; the defaults are the appendix's."""
 
     num_clusters: PositiveInt = 5
-    """K at initialisation; clusters may end up empty. With 1 the encoder is skipped."""
+    """K at initialisation; clusters may end up empty. With 1 there is nothing to train."""
     subtrajectory_length: int = Field(20, ge=2)
     """States per sub-trajectory."""
     sampling: Literal["fixed_length", "fixed_stride"] = "fixed_length"

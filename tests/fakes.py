@@ -58,8 +58,8 @@ def hopper_units(
 class FakeStage(Stage):
     """Each iteration it collects and adds up; a job's name says what else happens to it.
 
-    ``raises`` raises in every attempt from its second iteration on, ``killed`` kills its own process once, in the middle, and ``waits`` does not end
-    before the file ``go`` is in the run directory.
+    ``raises`` raises in every attempt from its second iteration on, ``killed`` kills its own process once, in the
+    middle, and ``waits`` does not end before the file ``go`` is in the run directory.
     """
 
     version = 1

@@ -32,21 +32,26 @@ class MLP(nn.Module):
             x = torch.tanh(layer(x))
         return self.layers[-1](x)
 
-    def directional_derivative(self, x: Tensor, tangents: list[Tensor]) -> Tensor:
+    @torch.no_grad()
+    def layer_inputs(self, x: Tensor) -> list[Tensor]:
+        """Return what each layer sees for (B, inputs); tanh is the dear part of a pass, so it is done once."""
+        inputs = [x]
+        for layer in self.layers[:-1]:
+            inputs.append(torch.tanh(layer(inputs[-1])))
+        return inputs
+
+    @torch.no_grad()
+    def directional_derivative(self, layer_inputs: list[Tensor], tangents: list[Tensor]) -> Tensor:
         """Return (B, outputs): the change of the output when the parameters move along ``tangents``.
 
         Forward-mode differentiation by hand, one pass; ``tangents`` are ordered as `parameters()`.
         """
-        change: Tensor | None = None
-        for i, layer in enumerate(self.layers):
-            along = torch.nn.functional.linear(x, tangents[2 * i], tangents[2 * i + 1])
-            if change is not None:
-                along = along + change @ layer.weight.T
-            if i + 1 < len(self.layers):
-                x = torch.tanh(layer(x))
-                along = along * (1 - x * x)
-            change = along
-        assert change is not None
+        change = torch.nn.functional.linear(layer_inputs[0], tangents[0], tangents[1])
+        for i, layer in enumerate(self.layers[1:], start=1):
+            change = change * (1 - layer_inputs[i].square())
+            change = torch.nn.functional.linear(layer_inputs[i], tangents[2 * i], tangents[2 * i + 1]).addmm_(
+                change, layer.weight.T
+            )
         return change
 
 

@@ -78,12 +78,12 @@ class Trpo:
         old_mean, old_log_std = mean.detach(), policy.log_std.detach().clone()
         precision = torch.exp(-2 * old_log_std) / len(observations)
         mean_parameters = list(policy.net.parameters())
+        layer_inputs = policy.net.layer_inputs(inputs)
 
         def fisher_product(vector: Tensor) -> Tensor:
             tangents = self._unflatten(vector)
             by_name = dict(zip(self._parameters, tangents, strict=True))
-            with torch.no_grad():
-                change = policy.net.directional_derivative(inputs, [by_name[p] for p in mean_parameters])
+            change = policy.net.directional_derivative(layer_inputs, [by_name[p] for p in mean_parameters])
             back = torch.autograd.grad(mean, mean_parameters, change * precision, retain_graph=True)
             images = dict(zip(mean_parameters, back, strict=True))
             images[policy.log_std] = 2 * by_name[policy.log_std]

@@ -1,6 +1,8 @@
 """Whatever is sent arrives bit for bit; whatever is not a message is refused and costs no memory."""
 
 import tracemalloc
+from contextlib import suppress
+from itertools import pairwise
 from typing import Any
 
 import msgpack
@@ -63,7 +65,7 @@ def policies(draw: st.DrawFn) -> GaussianPolicy:
     widths = draw(st.lists(st.integers(1, 4), min_size=2, max_size=4))
     f4 = np.float32
     return GaussianPolicy(
-        tuple(draw(array(f4, a, b)) for a, b in zip(widths[:-1], widths[1:], strict=True)),
+        tuple(draw(array(f4, a, b)) for a, b in pairwise(widths)),
         tuple(draw(array(f4, b)) for b in widths[1:]),
         draw(array(f4, widths[-1])),
         draw(array(f4, widths[0])),
@@ -138,7 +140,7 @@ def test_a_message_cut_short_or_with_other_frames_is_refused(message: Message, d
     frames = encode(message)
     index = data.draw(st.integers(0, len(frames) - 1))
     for damaged in (
-        frames[:index] + [frames[index] + b"\0"] + frames[index + 1 :],
+        [*frames[:index], frames[index] + b"\0", *frames[index + 1 :]],
         [*frames, b""],
         frames[:-1],
     ):
@@ -146,7 +148,7 @@ def test_a_message_cut_short_or_with_other_frames_is_refused(message: Message, d
             decode(damaged)
     if frames[index]:
         with pytest.raises(MessageError):
-            decode(frames[:index] + [frames[index][:-1]] + frames[index + 1 :])
+            decode([*frames[:index], frames[index][:-1], *frames[index + 1 :]])
 
 
 @settings(max_examples=100, deadline=None)
@@ -157,10 +159,8 @@ def test_a_flipped_byte_gives_a_message_or_an_error_and_nothing_else(message: Me
     at = data.draw(st.integers(0, len(frames[index]) - 1))
     flipped = bytearray(frames[index])
     flipped[at] ^= data.draw(st.integers(1, 255))
-    try:
+    with suppress(MessageError):
         decode([*frames[:index], bytes(flipped), *frames[index + 1 :]])
-    except MessageError:
-        pass
 
 
 values = st.recursive(

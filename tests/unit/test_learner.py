@@ -11,7 +11,7 @@ import torch
 from pipeline.algorithms.gail import AdversarialReward
 from pipeline.algorithms.learner import EnvReward, Learner
 from pipeline.artifacts import encode_arrays
-from pipeline.config import GailConfig, PpoConfig, TrpoConfig, ValueConfig
+from pipeline.config import DiscriminatorConfig, GailConfig, PpoConfig, TrainingConfig, TrpoConfig, ValueConfig
 from pipeline.rollout import Unit, collect
 from pipeline.seeding import derive_key
 
@@ -186,6 +186,15 @@ def test_normaliser_is_the_mean_and_deviation_of_all_observations(shown):
     np.testing.assert_allclose(learner.policy.input_scale.numpy(), 1 / together.std(axis=0), rtol=1e-5)
 
 
+def test_imitators_are_normalised_by_the_demonstrations_as_they_are_weighted(demonstrations):
+    both = demonstrations(4, 2)
+    reward = AdversarialReward(both, np.array([1.0, 3.0]), DiscriminatorConfig(hidden=(8,)), 0)
+    learner = Learner(3, 2, TrainingConfig(total_steps=100, policy_hidden=(8,)), reward, 0)
+    repeated = np.concatenate([both[0], both[1], both[1], both[1]]).astype(np.float64)
+    np.testing.assert_allclose(learner.policy.input_mean.numpy(), repeated.mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(learner.policy.input_scale.numpy(), 1 / repeated.std(axis=0), rtol=1e-5)
+
+
 def test_a_constant_observation_does_not_blow_up(shown):
     learner = build(shown, normalise_observations=True)
     learner._track(torch.full((50, 12), 3.0))
@@ -193,7 +202,7 @@ def test_a_constant_observation_does_not_blow_up(shown):
 
 
 def test_without_normalisation_the_policy_sees_raw_observations(shown):
-    learner = build(shown)
+    learner = build(shown, normalise_observations=False)
     train(learner, 0, 1)
     assert not learner.policy.input_mean.any()
     assert (learner.policy.input_scale == 1).all()

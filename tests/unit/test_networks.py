@@ -16,7 +16,7 @@ def test_directional_derivative_equals_forward_mode_autodiff():
         parameters = dict(net.named_parameters())
         tangents = {k: torch.randn(p.shape, generator=rng, dtype=torch.float64) for k, p in parameters.items()}
         _, expected = jvp(lambda p: functional_call(net, p, (x,)), (parameters,), (tangents,))  # noqa: B023
-        result = net.directional_derivative(x, list(tangents.values()))
+        result = net.directional_derivative(net.layer_inputs(x), list(tangents.values()))
         torch.testing.assert_close(result, expected, rtol=1e-10, atol=1e-12)
 
 
