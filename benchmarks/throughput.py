@@ -7,6 +7,7 @@ Each figure is a ratio whose two sides alternate within one run, so that a busy 
 * imitation: the same loop with PPO against the `imitation` library (benchmarks/README.md says how to install it).
 """
 
+# ruff: noqa: E402  (threads are limited before NumPy is imported, and the program may not be installed)
 import os
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -301,20 +302,18 @@ def machine() -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="write the figures to this file")
-    parser.add_argument("--parts", nargs="+", choices=("stepping", "learner", "imitation"), default=["stepping", "learner"])
+    parser.add_argument("--parts", nargs="*", choices=("stepping", "learner"), default=["stepping", "learner"])
     parser.add_argument("--envs", nargs="+", choices=ENVIRONMENTS, default=ENVIRONMENTS, metavar="ID")
-    parser.add_argument("--rounds", type=int, default=3, help="rounds of the long parts; stepping makes 20 times as many")
+    parser.add_argument(
+        "--rounds", type=int, default=3, help="rounds of the long parts; stepping makes 20 times as many"
+    )
     parser.add_argument("--steps", type=int, default=300_000, help="environment steps of each learner run")
     parser.add_argument("--workers", type=int, nargs="+", default=[0, 2], help="worker counts of the learner part")
-    parser.add_argument("--imitation-python", help="interpreter of the environment that holds `imitation`")
+    parser.add_argument("--imitation-python", help="interpreter of an environment with `imitation`; adds that part")
     arguments = parser.parse_args()
-    parts = [*arguments.parts, *(["imitation"] if arguments.imitation_python else [])]
-    if "imitation" in parts and not arguments.imitation_python:
-        parser.error(f"--imitation-python is needed; to make one:\n{IMITATION_SETUP}")
-
     cores = min(2, os.cpu_count() or 1)
     result: dict[str, Any] = {"machine": machine(), "versions": library_versions()}
-    if "stepping" in parts:
+    if "stepping" in arguments.parts:
         result["stepping"] = {}
         for env_id in arguments.envs:
             figures = result["stepping"][env_id] = stepping(env_id, 20 * arguments.rounds)
@@ -323,7 +322,7 @@ def main() -> None:
                 f"{figures['raw_steps_per_s']:9,.0f} raw: {figures['ratio']:.3f}",
                 flush=True,
             )
-    if "learner" in parts:
+    if "learner" in arguments.parts:
         result["learner"] = {}
         for env_id in arguments.envs:
             result["learner"][env_id] = []
@@ -331,11 +330,12 @@ def main() -> None:
                 figures = learner(env_id, workers, arguments.steps, arguments.rounds, cores)
                 result["learner"][env_id].append(figures)
                 print(
-                    f"learner   {env_id:22} {figures['loop_steps_per_s']:9,.0f} /s of {figures['raw_steps_per_s']:9,.0f} "
-                    f"raw on {cores} cores: {figures['ratio']:.3f} ({workers} workers)",
+                    f"learner   {env_id:22} {figures['loop_steps_per_s']:9,.0f} /s of "
+                    f"{figures['raw_steps_per_s']:9,.0f} raw on {cores} cores: {figures['ratio']:.3f} "
+                    f"({workers} workers)",
                     flush=True,
                 )
-    if "imitation" in parts:
+    if arguments.imitation_python:
         figures = imitation(arguments.imitation_python, arguments.steps, arguments.rounds, workers=2)
         result["imitation"] = figures
         print(
@@ -344,6 +344,8 @@ def main() -> None:
             f"({figures['ratio_workers']:.1f} times)",
             flush=True,
         )
+    else:
+        print(f"imitation not measured; to measure it:\n{IMITATION_SETUP}")
     result["machine"]["load_average_after"] = os.getloadavg()
     if arguments.json:
         arguments.json.parent.mkdir(parents=True, exist_ok=True)

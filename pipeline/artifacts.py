@@ -146,7 +146,10 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 def read_artifact(path: Path) -> Artifact | None:
-    """Return the artifact at ``path``, or None unless it is finished. Raises DamagedArtifactError for a bad manifest."""
+    """Return the artifact at ``path``, or None unless it is finished.
+
+    Raises DamagedArtifactError for a bad manifest.
+    """
     if not (path / MANIFEST).is_file():
         return None
     try:

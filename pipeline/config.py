@@ -24,6 +24,8 @@ class _Section(BaseModel):
 
 
 class EnvironmentConfig(_Section):
+    """An environment and its dynamics."""
+
     id: str = "oodil/Hopper-v0"
     """A Gymnasium id that has a batched form."""
     dynamics: dict[str, float] = {}
@@ -46,6 +48,8 @@ class TrpoConfig(_Section):
     """Halvings of the step before it is refused."""
     accept_ratio: UnitInterval = 0.1
     """Share of the expected improvement that a step must reach."""
+    anneal: bool = True
+    """Let the trust region shrink linearly to zero over the training."""
 
 
 class PpoConfig(_Section):
@@ -69,6 +73,8 @@ class PpoConfig(_Section):
 
 
 class ValueConfig(_Section):
+    """The value function and its regression."""
+
     hidden: Hidden = (64, 64)
     """Widths of the hidden layers."""
     learning_rate: PositiveFloat = 3e-4
@@ -80,12 +86,16 @@ class ValueConfig(_Section):
 
 
 class DiscriminatorConfig(_Section):
+    """The discriminator and its steps."""
+
     hidden: Hidden = (64, 64)
     """Widths of the hidden layers."""
     learning_rate: PositiveFloat = 1e-3
     """Adam's step size."""
     steps_per_iteration: PositiveInt = 1
     """Full-batch steps after each policy update."""
+    anneal: bool = True
+    """Let the step size fall linearly to zero over the training."""
 
 
 class TrainingConfig(_Section):
@@ -263,8 +273,8 @@ class TransferabilityConfig(_Section):
     """Times the demonstrations are scored while a job runs, evenly spaced."""
     averaged_scores: PositiveInt = 20
     """How many of the last scores are averaged."""
-    sharpening: float = Field(1.0, gt=0.0)
-    """Power to which a transferability is raised to become a weight; 1 is the paper's plain form."""
+    sharpening: float = Field(2.0, gt=0.0)
+    """Power to which a transferability is raised to become a weight; 1 is the paper's form (docs/decisions.md)."""
 
 
 class ImitationConfig(_Section):

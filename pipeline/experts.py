@@ -110,4 +110,3 @@ def collect_demonstrations(
         returns=np.array([episode.env_return for episode in kept[:count]]),
     )
     return demonstrations, share
-

@@ -104,8 +104,8 @@ def collect(unit: Unit) -> UnitResult:
         if ended.size:
             returns.extend(simulators.episode_returns()[ended].tolist())
             lengths.extend(simulators.elapsed_steps()[ended].tolist())
-            for g in ended:
-                simulators.reset(int(g), seed=int(rng.integers(2**31)))
+            for g in ended.tolist():
+                simulators.reset(g, seed=int(rng.integers(2**31)))
             current = simulators.observations()
 
     rollout = Rollout(

@@ -85,7 +85,9 @@ def main() -> None:
     trainer.train(rounds * batch, callback=lambda _: times.append(time.perf_counter()))
     first = int(WARM_UP * rounds)
     rate = (rounds - first) * batch / (times[-1] - times[first])
-    versions = {name: version(name) for name in ("imitation", "stable-baselines3", "gymnasium", "torch", "mujoco", "numpy")}
+    versions = {
+        name: version(name) for name in ("imitation", "stable-baselines3", "gymnasium", "torch", "mujoco", "numpy")
+    }
     print(json.dumps({"steps_per_s": rate, "rounds": rounds, "versions": versions}))
 
 

@@ -16,7 +16,7 @@ from pipeline.config import DiscriminatorConfig
 
 
 def discriminator_loss(demonstration_logits: Tensor, policy_logits: Tensor) -> Tensor:
-    """Return the binary cross-entropy -E_demo log D - E_policy log(1 - D), each term averaged; logits are (M,), (B,)."""
+    """Return -E_demo log D - E_policy log(1 - D), each term averaged, for (M,) and (B,) logits."""
     return softplus(-demonstration_logits).mean() + softplus(policy_logits).mean()
 
 

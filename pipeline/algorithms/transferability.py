@@ -27,7 +27,7 @@ def mean_logit_per_demonstration(discriminator: Discriminator, demonstrations: D
 
 
 def transferability(mean_logits: Array) -> Array:
-    """Return sigmoid(-mean logit): 0.5 where the imitator is indistinguishable from the demonstration, 0 where it fails.
+    """Return sigmoid(-mean logit): 0.5 where the imitator cannot be told from the demonstration, 0 where it fails.
 
     ``mean_logits`` is (N,) or (E, N), of logits that are high for demonstrations; the paper's D is one minus ours.
     """
@@ -44,6 +44,6 @@ def sharpened_weights(scores: Array, sharpening: float) -> Array:
 
 
 def sampling_mass(weights: Array, demonstrations: Demonstrations) -> Array:
-    """Return (N,) each demonstration's share of the drawn transitions: weight times its number of transitions (Eqn 7)."""
+    """Return (N,) shares of the drawn transitions: weight times number of transitions (Eqn 7)."""
     mass = weights * (demonstrations.lengths - 1)
     return np.asarray(mass / mass.sum())

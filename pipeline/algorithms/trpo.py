@@ -67,10 +67,12 @@ class Trpo:
             observations, actions: (B, S) and (B, A).
             log_probs: (B,) under the policy that acted; it may be one version behind.
             advantages: (B,) standardised.
-            rng, remaining: unused; every generator has the same signature.
+            rng: unused; every generator has the same signature.
+            remaining: share of the training that lies ahead, 1 at its start.
         Returns metrics: kl, improvement, step_fraction (0 when the step was refused), entropy.
         """
         config, policy = self.config, self.policy
+        max_kl = config.max_kl * (remaining if config.anneal else 1.0)
         inputs = policy.normalise(observations)
         mean = policy.net(inputs)
         surrogate = (torch.exp(policy.log_prob(mean, actions) - log_probs) * advantages).mean()
@@ -93,7 +95,7 @@ class Trpo:
         curvature = direction @ fisher_product(direction)
         if not bool(torch.isfinite(curvature)) or float(curvature) <= 0:
             return {"kl": 0.0, "improvement": 0.0, "step_fraction": 0.0, "entropy": _entropy(policy)}
-        full_step = torch.sqrt(2 * config.max_kl / curvature) * direction
+        full_step = torch.sqrt(2 * max_kl / curvature) * direction
         expected = float(gradient @ full_step)
         start = _flatten([p.detach() for p in self._parameters])
         before = float(surrogate.detach())
@@ -105,7 +107,7 @@ class Trpo:
                 ratio = torch.exp(policy.log_prob(new_mean, actions) - log_probs)
                 improvement = float((ratio * advantages).mean()) - before
                 kl = float(_mean_kl(old_mean, old_log_std, new_mean, policy.log_std))
-                if improvement > config.accept_ratio * fraction * expected and kl <= 1.5 * config.max_kl:
+                if improvement > config.accept_ratio * fraction * expected and kl <= 1.5 * max_kl:
                     metrics = {"kl": kl, "improvement": improvement, "step_fraction": fraction}
                     return metrics | {"entropy": _entropy(policy)}
                 fraction *= 0.5

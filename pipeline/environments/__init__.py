@@ -1,7 +1,7 @@
 """Environments: registration with Gymnasium, and batches of simulators for training.
 
-Importing this package registers the ids below; ``gymnasium.make("pipeline.environments:oodil/Hopper-v0", gravity=12.0)``
-imports it by itself.
+Importing this package registers the ids below, and ``gymnasium.make("pipeline.environments:oodil/Hopper-v0",
+gravity=12.0)`` imports it by itself.
 """
 
 from collections.abc import Mapping
@@ -26,13 +26,15 @@ for _id, _class in {
 def make_batch(env_id: str, dynamics: Mapping[str, float], num_simulators: int) -> MujocoBatch:
     """Build a batch of simulators of a registered environment with the given dynamics.
 
-    Raises ValueError for an id that is not registered or a task without a batched form, and TypeError for dynamics
-    that the environment does not have.
+    Raises ValueError for an id that is not registered, dynamics that the environment does not have, or a task without
+    a batched form.
     """
     try:
         env = gymnasium.make(env_id, **dynamics)
     except gymnasium.error.Error as error:
         raise ValueError(f"environment {env_id!r} cannot be made: {error}") from error
+    except TypeError as error:
+        raise ValueError(f"environment {env_id!r} does not take the dynamics {dict(dynamics)}: {error}") from error
     if not hasattr(env.unwrapped, "batch_healthy"):
         raise ValueError(f"environment {env_id!r} has no batched form; those that have are {', '.join(batched_ids())}")
     assert env.spec is not None and env.spec.max_episode_steps is not None

@@ -41,7 +41,9 @@ class StepOutcome:
 class MujocoBatch:
     """G simulators of one locomotion task; the caller decides when an ended one is reset."""
 
-    def __init__(self, env: HopperEnv | Walker2dEnv | HalfCheetahEnv, num_simulators: int, max_episode_steps: int) -> None:
+    def __init__(
+        self, env: HopperEnv | Walker2dEnv | HalfCheetahEnv, num_simulators: int, max_episode_steps: int
+    ) -> None:
         self.env = env
         self.num_simulators = num_simulators
         self.max_episode_steps = max_episode_steps

@@ -1,8 +1,8 @@
 """Gymnasium's v5 locomotion tasks with their dynamics as keyword arguments.
 
-The observation is ``[qpos, qvel]`` with root x, as the paper's experiments use it (docs/environments.md). Dynamics are
-set on the compiled model, so no XML is copied. Each class also states its health rule and its reset noise for a whole
-batch of simulators at once; `pipeline.environments.batch` steps them and is tested to agree with these classes to the bit.
+The observation is ``[qpos, qvel]`` with root x, as the paper's experiments use it. Dynamics are set on the compiled
+model, so no XML is copied. Each class also states its health rule and its reset noise for a whole batch of simulators at once;
+`pipeline.environments.batch` steps them and is tested to agree with these classes to the bit.
 """
 
 from typing import Any

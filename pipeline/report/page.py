@@ -1,7 +1,5 @@
 """The page around the figures: what was run, what came out, and what a reader has to know before quoting it."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 
@@ -9,8 +7,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from pipeline.report import figures
-from pipeline.report.figures import Curve, Look
+from pipeline.report import figures, pieces
+from pipeline.report.collection import Collection, Source, read_collection
+from pipeline.report.figures import Curve
 from pipeline.report.style import CSS
 from pipeline.results import STAGES, Results
 from pipeline.stage import Run
@@ -39,47 +38,10 @@ QUALITY = (
 """Key, name and digits of what is said about the clusters."""
 
 
-@dataclass(frozen=True)
-class Source:
-    """A demonstrator as the report shows it."""
-
-    label: str
-    transferable: bool | None
-    count: int
-    look: Look
-
-
-@dataclass(frozen=True)
-class Collection:
-    """The demonstrations as the report needs them: whose they are and how many transitions each has."""
-
-    sources: list[Source]
-    source_of: NDArray[np.int32]
-    """(N,) index into ``sources``."""
-    transitions: NDArray[np.int64]
-    """(N,)"""
-    own_returns: list[float | None]
-    """Mean return of each source in its own environment."""
-
-    @property
-    def looks(self) -> list[Look]:
-        """One per source."""
-        return [source.look for source in self.sources]
-
-    @property
-    def labelled(self) -> bool:
-        """Whether it is known whose the demonstrations are."""
-        return len(self.sources) > 1 or self.sources[0].transferable is not None
-
-    def shares(self, mass: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return each source's share of a mass (N,)."""
-        return np.asarray(np.bincount(self.source_of, mass, minlength=len(self.sources)) / mass.sum())
-
-
 def render(run: Run) -> str:
     """Return the HTML of the report for everything that is finished."""
     results = Results(run)
-    collection = _collection(results)
+    collection = read_collection(results)
     body = [
         _learning_section(results),
         _transferability_section(results, collection),
@@ -97,25 +59,6 @@ def render(run: Run) -> str:
     )
 
 
-def _collection(results: Results) -> Collection | None:
-    arrays = results.arrays("demonstrations", "demonstrations.safetensors")
-    if not arrays:
-        return None
-    described = results.json("demonstrations", "demonstrations.json")
-    transitions = np.diff(arrays["offsets"]) - 1
-    labels = described.get("source_labels") or ["all demonstrations"]
-    source_of = arrays["sources"] if described.get("source_labels") else np.zeros(len(transitions), np.int32)
-    transferable = described.get("transferable") or [None] * len(labels)
-    counts = np.bincount(source_of, minlength=len(labels))
-    looks = figures.source_looks(transferable)
-    sources = [
-        Source(label, known, int(number), look)
-        for label, known, number, look in zip(labels, transferable, counts, looks, strict=True)
-    ]
-    means = [float(np.mean(arrays["returns"][source_of == i])) if counts[i] else np.nan for i in range(len(labels))]
-    return Collection(sources, source_of, transitions, [mean if np.isfinite(mean) else None for mean in means])
-
-
 # -- the top of the page -------------------------------------------------------------------------------------------
 
 
@@ -126,14 +69,18 @@ def _headline(results: Results, collection: Collection | None) -> str:
     if collection is None:
         lead = f"Imitator: {imitator}."
     else:
-        lead = f"Imitator: {imitator}. It learns from {_plural(len(collection.transitions), 'demonstration')}"
-        lead += f" of {_plural(len(collection.sources), 'source')}." if collection.labelled else "; whose is not known."
+        lead = f"Imitator: {imitator}. It learns from {pieces.plural(len(collection.transitions), 'demonstration')}"
+        lead += (
+            f" of {pieces.plural(len(collection.sources), 'source')}."
+            if collection.labelled
+            else "; whose is not known."
+        )
     finding = _finding(results)
     return (
         f'<header>\n<p class="kicker">Imitation from demonstrators with other dynamics</p>\n'
         f'<h1>{escape(config.name)}</h1>\n<p class="lead">{lead}</p>\n'
         + (
-            _legend(collection.sources, counts=True) + _families(collection)
+            pieces.legend(collection.sources, counts=True) + _families(collection)
             if collection and collection.labelled
             else ""
         )
@@ -146,7 +93,7 @@ def _families(collection: Collection) -> str:
     """Say what the colours mean."""
     meanings = {True: "Blue: known to be transferable to the imitator.", False: "Orange: known not to be."}
     told = [meaning for known, meaning in meanings.items() if any(s.transferable is known for s in collection.sources)]
-    return _caption(" ".join(told)) if told else ""
+    return pieces.caption(" ".join(told)) if told else ""
 
 
 def _finding(results: Results) -> str:
@@ -155,13 +102,15 @@ def _finding(results: Results) -> str:
     )
     if ours is None:
         return ""
-    text = f"The policy learned from weighted demonstrations returns <b>{_return(ours)}</b>"
+    text = f"The policy learned from weighted demonstrations returns <b>{pieces.returned(ours)}</b>"
     if naive is not None:
         comparable = ours > 0 and naive > 0
         text += f", {ours / naive:.1f} times" if comparable else ", against"
-        text += f" the {_return(naive)} of naive GAIL" if comparable else f" {_return(naive)} of naive GAIL"
+        text += (
+            f" the {pieces.returned(naive)} of naive GAIL" if comparable else f" {pieces.returned(naive)} of naive GAIL"
+        )
     if oracle is not None:
-        text += f"; the oracle, which is told what is transferable, reaches {_return(oracle)}"
+        text += f"; the oracle, which is told what is transferable, reaches {pieces.returned(oracle)}"
     return text + "."
 
 
@@ -180,21 +129,25 @@ def _cards(results: Results) -> str:
         cards.append(
             _card(
                 f"Final return, {name}",
-                _return(final.get("final_return")),
+                pieces.returned(final.get("final_return")),
                 _spread(final) if asked else "not asked for",
             )
         )
     before, after = scores.get("transferable_share_before"), scores.get("transferable_share")
-    share = f'{_percent(before)}<span class="arrow">→</span>{_percent(after)}' if after is not None else None
+    share = (
+        f'{pieces.percent(before)}<span class="arrow">→</span>{pieces.percent(after)}' if after is not None else None
+    )
     cards.append(_card("Transferable share", share, "of what the policy learns from, before and after weighting"))
     cards.append(
-        _card("AUROC", _number(scores.get("auroc"), 3), "1 if all transferable demonstrations rank above all others")
+        _card(
+            "AUROC", pieces.number(scores.get("auroc"), 3), "1 if all transferable demonstrations rank above all others"
+        )
     )
-    cards.append(_card("Purity of clusters", _number(diagnostics.get("purity"), 3), _cluster_note(diagnostics)))
+    cards.append(_card("Purity of clusters", pieces.number(diagnostics.get("purity"), 3), _cluster_note(diagnostics)))
     cards.append(
         _card("Environment steps", figures.count(sum(env_steps.values())) if env_steps else None, "in all trainings")
     )
-    cards.append(_card("Time", _duration(sum(seconds.values())) if seconds else None, "of all finished stages"))
+    cards.append(_card("Time", pieces.duration(sum(seconds.values())) if seconds else None, "of all finished stages"))
     return f'<dl class="cards">\n{"".join(cards)}</dl>'
 
 
@@ -203,7 +156,7 @@ def _spread(final: dict[str, Any]) -> str:
     if spread is None or episodes is None:
         return ""
     digits = f"{spread:,.0f}" if abs(final.get("final_return") or 0) >= 100 else f"{spread:.2g}"
-    return f"± {digits} over {_plural(episodes, 'episode')}"
+    return f"± {digits} over {pieces.plural(episodes, 'episode')}"
 
 
 def _cluster_note(diagnostics: dict[str, Any]) -> str:
@@ -243,13 +196,13 @@ def _notes(results: Results, collection: Collection | None) -> str:
         notes.append(f"The final policies were not trained for equally long ({named} environment steps).")
     if collection and any(source.transferable is None for source in collection.sources):
         notes.append(
-            "It is not known of every source whether it is transferable, so there is no AUROC and no transferable share "
-            "to judge the scores by."
+            "It is not known of every source whether it is transferable, so there is no AUROC and no transferable "
+            "share to judge the scores by."
         )
     stability = results.json("clustering", "diagnostics.json").get("label_stability")
     if stability is not None and stability < UNSTABLE_LABELS:
         notes.append(
-            f"Clusters are unstable: only {_percent(stability)} of the demonstrations keep theirs when other parts of "
+            f"Clusters are unstable: only {pieces.percent(stability)} of the demonstrations keep theirs when other parts of "
             "them are drawn."
         )
     if not notes:
@@ -265,15 +218,17 @@ def _learning_section(results: Results) -> str:
     ours, naive = (_curve(results, stage) for stage in ("imitation", "naive_gail"))
     oracle = _final(results, "oracle").get("final_return")
     if ours is None and naive is None:
-        return _section("The policy", _missing("No policy has been trained yet."))
+        return pieces.section("The policy", pieces.missing("No policy has been trained yet."))
     episodes = results.run.config.imitation.gail.evaluation_episodes
     caption = (
-        f"True return of the deterministic policy in the imitator's environment, {_plural(episodes, 'episode')} at "
+        f"True return of the deterministic policy in the imitator's environment, {pieces.plural(episodes, 'episode')} at "
         "each point; the bands are one standard deviation of the episodes. The return is never used for learning. "
     )
     if oracle is not None:
         caption += "Dashed: the final return of the oracle, which imitates only what is known to be transferable."
-    return _section("The policy", _figure(figures.learning(ours, naive, oracle), "Learning curves") + _caption(caption))
+    return pieces.section(
+        "The policy", pieces.figure(figures.learning(ours, naive, oracle), "Learning curves") + pieces.caption(caption)
+    )
 
 
 def _curve(results: Results, stage: str) -> Curve | None:
@@ -287,19 +242,21 @@ def _curve(results: Results, stage: str) -> Curve | None:
 def _transferability_section(results: Results, collection: Collection | None) -> str:
     arrays = results.arrays("transferability", "transferability.safetensors")
     if collection is None or not arrays:
-        return _section("Transferability", _missing("The transferability of the demonstrations is not known yet."))
+        return pieces.section(
+            "Transferability", pieces.missing("The transferability of the demonstrations is not known yet.")
+        )
     summary = results.json("transferability", "summary.json")
     before = collection.transitions.astype(np.float64)
     after = before * arrays["weights"]
     sharpening = summary.get("sharpening")
     parts = [
-        _caption(
+        pieces.caption(
             "Each mark is one demonstration: how far the discriminator of its cluster's job takes it for something "
             "that the imitator itself does. A demonstration is drawn for imitation in proportion to "
             + ("this value." if sharpening in (None, 1) else f"this value to the power {sharpening:g}.")
         ),
-        _legend(collection.sources),
-        _figure(
+        pieces.legend(collection.sources),
+        pieces.figure(
             figures.transferability(arrays["scores"], collection.source_of, collection.looks),
             "Transferability of every demonstration, sorted",
         ),
@@ -308,7 +265,7 @@ def _transferability_section(results: Results, collection: Collection | None) ->
         _source_table(collection, summary.get("mean_score_by_source") or {}, before, after),
         _convergence(results, collection),
     ]
-    return _section("Transferability", "\n".join(parts))
+    return pieces.section("Transferability", "\n".join(parts))
 
 
 def _mass_bars(collection: Collection, before: NDArray[np.float64], after: NDArray[np.float64]) -> str:
@@ -321,8 +278,8 @@ def _mass_bars(collection: Collection, before: NDArray[np.float64], after: NDArr
 
 def _segment(source: Source, share: float) -> str:
     style = f"flex:{share:.5f};background:{source.look.colour};color:{source.look.text}"
-    shown = _percent(share) if share >= 0.05 else ""
-    return f'<span style="{style}" title="{escape(source.label)}: {_percent(share)}">{shown}</span>'
+    shown = pieces.percent(share) if share >= 0.05 else ""
+    return f'<span style="{style}" title="{escape(source.label)}: {pieces.percent(share)}">{shown}</span>'
 
 
 def _source_table(
@@ -335,14 +292,14 @@ def _source_table(
     for source, own_return, share_before, share_after in columns:
         known = {True: "yes", False: "no", None: "not known"}[source.transferable]
         cells = (
-            str(source.count), _return(own_return) or "–", _number(mean_scores.get(source.label), 3) or "–",
-            _percent(share_before), _percent(share_after),
+            str(source.count), pieces.returned(own_return) or "–", pieces.number(mean_scores.get(source.label), 3) or "–",
+            pieces.percent(share_before), pieces.percent(share_after),
         )  # fmt: skip
         numbers = "".join(f'<td class="number">{cell}</td>' for cell in cells)
-        rows += f"<tr><th>{_name(source)}</th><td>{known}</td>{numbers}</tr>\n"
+        rows += f"<tr><th>{pieces.name(source)}</th><td>{known}</td>{numbers}</tr>\n"
     titles = ("demonstrations", "return in its own dynamics", "mean transferability", "share before", "share after")
     head = "<th>source</th><th>transferable</th>" + "".join(f'<th class="number">{title}</th>' for title in titles)
-    return _table(head, rows)
+    return pieces.table(head, rows)
 
 
 def _convergence(results: Results, collection: Collection) -> str:
@@ -359,35 +316,35 @@ def _convergence(results: Results, collection: Collection) -> str:
         "Scores while the job of each cluster ran: mean and the range of the middle 80 % of its demonstrations, in the "
         "colour of its most frequent source. A curve that still moves at its end asks for a longer job."
     )
-    drawn = _figure(figures.convergence(histories, colours), "Scores of each cluster over environment steps")
-    return f"<h3>Did the scores settle?</h3>\n{_caption(caption)}\n{drawn}"
+    drawn = pieces.figure(figures.convergence(histories, colours), "Scores of each cluster over environment steps")
+    return f"<h3>Did the scores settle?</h3>\n{pieces.caption(caption)}\n{drawn}"
 
 
 def _clustering_section(results: Results, collection: Collection | None) -> str:
     arrays = results.arrays("clustering", "assignment.safetensors")
     if collection is None or not arrays:
-        return _section("Clusters", _missing("The demonstrations have not been clustered yet."))
+        return pieces.section("Clusters", pieces.missing("The demonstrations have not been clustered yet."))
     diagnostics = results.json("clustering", "diagnostics.json")
     projected = figures.project(arrays["features"])
     if projected is None:
-        drawn = _missing("There is no embedding to show: the demonstrations were not told apart, or are too few.")
+        drawn = pieces.missing("There is no embedding to show: the demonstrations were not told apart, or are too few.")
     else:
         points, projection = projected
-        drawn = _caption(
+        drawn = pieces.caption(
             f"The embedding of the demonstrations, brought to two dimensions by {projection}"
             + (", in which only neighbourhoods mean something, not distances." if projection == "t-SNE" else ".")
             + " The method sees no sources; they are shown to judge it."
         )
-        drawn += _legend(collection.sources)
+        drawn += pieces.legend(collection.sources)
         svg = figures.embedding(points, arrays["labels"], collection.source_of, collection.looks)
-        drawn += _figure(svg, "Embedding of the demonstrations, by cluster and by source")
+        drawn += pieces.figure(svg, "Embedding of the demonstrations, by cluster and by source")
     named = [
-        f"{title} {_number(diagnostics[key], digits)}"
+        f"{title} {pieces.number(diagnostics[key], digits)}"
         for key, title, digits in QUALITY
         if diagnostics.get(key) is not None
     ]
-    listed = _caption(f"Quality: {', '.join(named)}.") if named else ""
-    return _section("Clusters", f"{drawn}\n{_contingency(results, collection, diagnostics)}\n{listed}")
+    listed = pieces.caption(f"Quality: {', '.join(named)}.") if named else ""
+    return pieces.section("Clusters", f"{drawn}\n{_contingency(results, collection, diagnostics)}\n{listed}")
 
 
 def _contingency(results: Results, collection: Collection, diagnostics: dict[str, Any]) -> str:
@@ -404,14 +361,14 @@ def _contingency(results: Results, collection: Collection, diagnostics: dict[str
         counts = contingency[source.label]
         total = max(sum(counts), 1)
         cells = "".join(_heat(counts[k], counts[k] / total) for k in used)
-        rows += f"<tr><th>{_name(source)}</th>{cells}</tr>\n"
+        rows += f"<tr><th>{pieces.name(source)}</th>{cells}</tr>\n"
     scores = results.arrays("transferability", "transferability.safetensors")
     if scores:
         means = [scores["scores"][scores["clusters"] == k] for k in used]
         cells = "".join(f"<td>{mean.mean():.3f}</td>" if len(mean) else "<td>–</td>" for mean in means)
         rows += f'<tr class="mean"><th>mean transferability</th>{cells}</tr>\n'
     head = "<th>cluster</th>" + "".join(f"<th>{k}</th>" for k in used)
-    return "<h3>Which source went into which cluster</h3>\n" + _table(head, rows, "heat")
+    return "<h3>Which source went into which cluster</h3>\n" + pieces.table(head, rows, "heat")
 
 
 def _heat(count: int, share: float) -> str:
@@ -427,7 +384,7 @@ def _provenance_section(results: Results) -> str:
         artifact = results.artifacts.get(stage)
         if artifact is None and stage not in results.problems:
             continue
-        time = _duration(seconds[stage]) if stage in seconds else "–"
+        time = pieces.duration(seconds[stage]) if stage in seconds else "–"
         steps = f"{env_steps[stage]:,}" if stage in env_steps else "–"
         made = f"<code>{artifact.sha256}</code>" if artifact else escape(results.problems[stage])
         numbers = f'<td class="number">{time}</td><td class="number">{steps}</td>'
@@ -439,11 +396,11 @@ def _provenance_section(results: Results) -> str:
     config = yaml.safe_dump(run.config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     parts = [
         f"<p>Root seed {run.config.seed}; every random stream is derived from it.</p>",
-        _table(head, rows),
+        pieces.table(head, rows),
         _versions(results),
         f"<details><summary>Resolved configuration</summary><pre>{escape(config)}</pre></details>",
     ]
-    return _section("What was run", "\n".join(parts))
+    return pieces.section("What was run", "\n".join(parts))
 
 
 def _versions(results: Results) -> str:
@@ -459,66 +416,3 @@ def _versions(results: Results) -> str:
         ]
         listed.append(f"{escape(library)} {escape(' and '.join(each))}")
     return f"<p>Made with {', '.join(listed)}.</p>" if listed else ""
-
-
-# -- pieces --------------------------------------------------------------------------------------------------------
-
-
-def _section(title: str, content: str) -> str:
-    return f"<section>\n<h2>{title}</h2>\n{content}\n</section>"
-
-
-def _figure(svg: str, description: str) -> str:
-    accessible = svg.replace("<svg", f'<svg role="img" aria-label="{description}"', 1)
-    return f"<figure>{accessible}</figure>"
-
-
-def _table(head: str, rows: str, kind: str = "plain") -> str:
-    body = f"<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}</tbody>"
-    return f'<div class="scroll"><table class="{kind}">\n{body}\n</table></div>'
-
-
-def _caption(text: str) -> str:
-    return f'<p class="caption">{text}</p>'
-
-
-def _missing(text: str) -> str:
-    return f'<p class="missing">{text}</p>'
-
-
-def _legend(sources: Iterable[Source], counts: bool = False) -> str:
-    items = "".join(f"<li>{_name(source)}{f' ({source.count})' if counts else ''}</li>" for source in sources)
-    return f'<ul class="legend">{items}</ul>\n'
-
-
-def _name(source: Source) -> str:
-    swatch = f'<span class="swatch" style="color:{source.look.colour}">{source.look.glyph}</span>'
-    return swatch + escape(source.label or "unnamed")
-
-
-def _plural(number: int, noun: str) -> str:
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
-
-
-def _return(value: float | None) -> str | None:
-    if value is None:
-        return None
-    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
-
-
-def _number(value: float | None, digits: int) -> str | None:
-    return None if value is None else f"{value:.{digits}f}"
-
-
-def _percent(share: float | None) -> str:
-    if share is None:
-        return "–"
-    return f"{100 * share:.1f} %" if 0 < share < 0.0995 or 0.9905 < share < 0.9995 else f"{100 * share:.0f} %"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 60:
-        return f"{seconds:.0f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes_left = divmod(minutes, 60)
-    return f"{hours} h {minutes_left:02d} min" if hours else f"{minutes} min {rest:02d} s"

@@ -1,7 +1,7 @@
 """Training the experts of a configuration: a stage of its own, run by ``oodil demos collect --train`` alone.
 
-A training that gets stuck is started again with the next seed, until its episodes last. This selection, like the training
-itself, uses the true reward, as making a demonstrator does; no later stage sees it.
+A training that gets stuck is started again with the next seed, until its episodes last. This selection, like the
+training itself, uses the true reward, as making a demonstrator does; no later stage sees it.
 """
 
 from typing import Any
@@ -71,7 +71,7 @@ class ExpertsStage(Stage):
         for job, source in zip(self.jobs(run), run.config.demonstrations.sources, strict=True):
             trained = run.job_artifact(self.name, job)
             files = {name: trained.read(name) for name in trained.hashes}
-            write_artifact(source.expert, trained.origin["settings"]["sources"][source.label], files, library_versions())
+            write_artifact(source.expert, {"expert": source.dynamics}, files, library_versions())
             reached = trained.json("expert.json")["stochastic"]
             lines.append(
                 f"{source.label}: return {reached['return_mean']:,.0f} ± {reached['return_std']:,.0f}, "

@@ -1,4 +1,4 @@
-"""Stage 4: the policy, by GAIL on weighted demonstrations (Eqn 7 and 8), and the baselines that differ in weights alone."""
+"""Stage 4: the policy, by GAIL on weighted demonstrations (Eqn 7 and 8); the baselines differ in weights alone."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from pipeline.config import RunConfig
 from pipeline.data import Demonstrations
 from pipeline.environments import make_batch
 from pipeline.evaluation import evaluate
-from pipeline.seeding import torch_seed, derive_key
+from pipeline.seeding import derive_key, torch_seed
 from pipeline.stage import JobContext, Run, Stage
 from pipeline.stages.demonstrations import load_demonstrations, transferable_mask
 from pipeline.training import Probe, train

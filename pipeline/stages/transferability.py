@@ -19,7 +19,7 @@ from pipeline.algorithms.transferability import (
 from pipeline.artifacts import Files, encode_arrays, encode_json
 from pipeline.config import RunConfig
 from pipeline.environments import make_batch
-from pipeline.seeding import torch_seed, derive_key
+from pipeline.seeding import derive_key, torch_seed
 from pipeline.stage import JobContext, Run, Stage
 from pipeline.stages.demonstrations import load_demonstrations, transferable_mask
 from pipeline.training import Probe, train
@@ -55,9 +55,7 @@ class TransferabilityStage(Stage):
         probe = Probe(
             "logits", section.num_scores, lambda: mean_logit_per_demonstration(reward.discriminator, demonstrations)
         )
-        history = train(
-            learner, config.environment, section.gail, [probe], context, self.checkpoints(run, job)
-        )
+        history = train(learner, config.environment, section.gail, [probe], context, self.checkpoints(run, job))
         discriminator = {name: value.numpy() for name, value in reward.discriminator.state_dict().items()}
         return {
             _JOB_FILE: encode_arrays(
@@ -85,10 +83,11 @@ class TransferabilityStage(Stage):
             history[f"{cluster}/scores"] = transferability(arrays["logits"])
             history[f"{cluster}/demonstrations"] = arrays["demonstrations"]
         scores = transferability(logits)
-        weights = sharpened_weights(scores, config.transferability.sharpening)
+        sharpening = config.transferability.sharpening
+        weights = sharpened_weights(scores, sharpening)
         arrays = {"scores": scores, "weights": weights, "clusters": _labels(run)}
         summary: dict[str, Any] = {
-            "sharpening": config.transferability.sharpening,
+            "sharpening": sharpening,
             "mean_score_by_source": {
                 label: float(scores[demonstrations.sources == i].mean())
                 for i, label in enumerate(demonstrations.source_labels)
@@ -96,12 +95,13 @@ class TransferabilityStage(Stage):
         }
         marked = transferable_mask(config, demonstrations)
         if marked is not None and 0 < marked.sum() < len(marked):
-            uniform = np.ones(len(demonstrations))
-            summary |= {
-                "auroc": float(roc_auc_score(marked, scores)),
-                "transferable_share": float(sampling_mass(weights, demonstrations)[marked].sum()),
-                "transferable_share_before": float(sampling_mass(uniform, demonstrations)[marked].sum()),
+            shares = {
+                "transferable_share_before": np.ones(len(demonstrations)),
+                "transferable_share_unsharpened": scores,
+                "transferable_share": weights,
             }
+            summary |= {name: float(sampling_mass(w, demonstrations)[marked].sum()) for name, w in shares.items()}
+            summary["auroc"] = float(roc_auc_score(marked, scores))
         return {
             "transferability.safetensors": encode_arrays(arrays),
             "history.safetensors": encode_arrays(history),

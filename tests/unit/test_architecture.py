@@ -12,7 +12,17 @@ ROOT = Path(__file__).parents[2]
 PROCESS_MODULES = {"multiprocessing", "subprocess", "concurrent", "joblib"}
 PROCESS_CALLS = {"os.fork", "os.forkpty", "os.system", "os.popen", "pty.fork", "pty.spawn"}
 PROCESS_PREFIXES = ("os.exec", "os.spawn", "os.posix_spawn", "torch.multiprocessing")
-UNSAFE_MODULES = {"pickle", "_pickle", "cPickle", "dill", "cloudpickle", "jsonpickle", "msgpack_numpy", "shelve", "marshal"}
+UNSAFE_MODULES = {
+    "pickle",
+    "_pickle",
+    "cPickle",
+    "dill",
+    "cloudpickle",
+    "jsonpickle",
+    "msgpack_numpy",
+    "shelve",
+    "marshal",
+}
 UNSAFE_CALLS = {"torch.load", "torch.save", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "np.load", "numpy.load"}
 UNSAFE_METHODS = {"send_pyobj", "recv_pyobj"}
 CONVERTERS: set[str] = set()

@@ -307,5 +307,11 @@ class TestCheckpoints:
 def test_the_artifact_of_a_single_job_is_that_of_its_stage(tmp_path):
     run = RunDirectory(tmp_path)
     assert run.job("clustering", "clustering") == run.stage("clustering")
-    places = {run.stage("a"), run.job("a", "k0"), run.job("a", "k1"), run.checkpoints("a", "a"), run.checkpoints("a", "k0")}
+    places = {
+        run.stage("a"),
+        run.job("a", "k0"),
+        run.job("a", "k1"),
+        run.checkpoints("a", "a"),
+        run.checkpoints("a", "k0"),
+    }
     assert len(places) == 5

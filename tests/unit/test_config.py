@@ -48,7 +48,10 @@ def write(tmp_path):
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
 def test_every_shipped_configuration_loads(path):
-    assert load_config(path).name == path.stem
+    config = load_config(path)
+    assert config.name.replace("-", "_") == path.stem
+    for source in config.demonstrations.sources:
+        assert source.expert.parent == ROOT / "configs" / "experts"
 
 
 def test_a_minimal_file_gets_the_defaults(write, tmp_path):

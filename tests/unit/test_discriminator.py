@@ -72,7 +72,9 @@ def test_training_separates_the_two_and_rewards_what_looks_like_a_demonstration(
     assert metrics[-1]["demonstration_accuracy"] > 0.95
     assert metrics[-1]["policy_accuracy"] > 0.95
     with torch.no_grad():
-        assert imitation_reward(discriminator(demonstration)).mean() > 2 * imitation_reward(discriminator(policy)).mean()
+        assert (
+            imitation_reward(discriminator(demonstration)).mean() > 2 * imitation_reward(discriminator(policy)).mean()
+        )
 
 
 def test_metrics_describe_the_state_before_the_step(pairs):

@@ -9,6 +9,8 @@ from gymnasium.utils.env_checker import check_env
 from pipeline.environments import batched_ids, make_batch
 
 HOPPER, WALKER, CHEETAH = "oodil/Hopper-v0", "oodil/Walker2d-v0", "oodil/HalfCheetah-v0"
+FOREVER = {"terminate_when_unhealthy": False}
+"""With this episodes go on when the robot has fallen."""
 
 
 def set_gravity(model):
@@ -99,9 +101,8 @@ def test_batch_equals_gymnasium(env_id, base, dynamics, change):
 @pytest.mark.parametrize(("env_id", "base", "dynamics", "change"), [SAME_DYNAMICS[0], SAME_DYNAMICS[2]])
 def test_batch_equals_gymnasium_at_the_time_limit(env_id, base, dynamics, change):
     """Episodes that may go on when the robot has fallen last to the limit and are truncated there."""
-    forever = {"terminate_when_unhealthy": False}
-    batch = make_batch(env_id, dynamics | forever, 2)
-    envs = [gymnasium_env(base, change, **forever) for _ in range(2)]
+    batch = make_batch(env_id, dynamics | FOREVER, 2)
+    envs = [gymnasium_env(base, change, **FOREVER) for _ in range(2)]
     assert assert_equal_steps(batch, envs, 1010, random_actions(batch, 0.2)) == (0, 2)
 
 
@@ -137,17 +138,23 @@ def test_registered_ids():
     assert {HOPPER, WALKER, CHEETAH} <= set(batched_ids())
 
 
-@pytest.mark.parametrize("env_id", [HOPPER, WALKER, CHEETAH])
-def test_a_snapshot_continues_to_the_same_bits(env_id, assert_same_bits):
-    batch = make_batch(env_id, {}, 3)
-    actions = random_actions(batch)
+@pytest.mark.parametrize(
+    ("env_id", "dynamics", "size"),
+    [(HOPPER, {}, 1.0), (HOPPER, FOREVER, 0.3), (WALKER, FOREVER, 0.3), (CHEETAH, {}, 1.0), (CHEETAH, {}, 0.1)],
+)
+def test_a_snapshot_continues_to_the_same_bits(env_id, dynamics, size, assert_same_bits):
+    """A robot that lies about shows whether the solver's warm start is part of the snapshot."""
+    batch = make_batch(env_id, dynamics, 3)
+    actions = random_actions(batch, size)
     plan = [actions(t) for t in range(450)]
 
     def play(simulators, first, last):
         history = []
         for t in range(first, last):
             outcome = simulators.step(plan[t])
-            history.append((simulators.observations(), outcome, simulators.elapsed_steps(), simulators.episode_returns()))
+            history.append(
+                (simulators.observations(), outcome, simulators.elapsed_steps(), simulators.episode_returns())
+            )
             for g in np.flatnonzero(outcome.terminated | outcome.truncated):
                 simulators.reset(int(g), seed=3 * t + int(g))
         return history
@@ -161,7 +168,7 @@ def test_a_snapshot_continues_to_the_same_bits(env_id, assert_same_bits):
     expected = play(batch, 150, 450)
     batch.restore(snapshot)
     assert_same_bits(play(batch, 150, 450), expected)
-    other = make_batch(env_id, {}, 3)
+    other = make_batch(env_id, dynamics, 3)
     for g in range(3):
         other.reset(g, seed=77)
     other.restore(snapshot)
@@ -264,19 +271,19 @@ def test_one_environments_dynamics_do_not_leak_into_another():
 
 
 @pytest.mark.parametrize(
-    ("env_id", "dynamics", "error", "message"),
+    ("env_id", "dynamics", "message"),
     [
-        ("oodil/Hoper-v0", {}, ValueError, "oodil/Hoper-v0"),
-        ("CartPole-v1", {}, ValueError, "no batched form.*oodil/Hopper-v0"),
-        (HOPPER, {"gravity": 0.0}, ValueError, "gravity is 0.0"),
-        (HOPPER, {"gravity": float("nan")}, ValueError, "gravity is nan"),
-        (HOPPER, {"gravity": float("inf")}, ValueError, "gravity is inf"),
-        (WALKER, {"friction": -1.0}, ValueError, "friction is -1.0"),
-        (CHEETAH, {"front": -0.1}, ValueError, "front and back are -0.1"),
-        (CHEETAH, {"back": float("nan")}, ValueError, "front and back are 1.0 and nan"),
-        (HOPPER, {"friction": 1.0}, TypeError, "friction"),
+        ("oodil/Hoper-v0", {}, "oodil/Hoper-v0"),
+        ("CartPole-v1", {}, "no batched form.*oodil/Hopper-v0"),
+        (HOPPER, {"gravity": 0.0}, "gravity is 0.0"),
+        (HOPPER, {"gravity": float("nan")}, "gravity is nan"),
+        (HOPPER, {"gravity": float("inf")}, "gravity is inf"),
+        (WALKER, {"friction": -1.0}, "friction is -1.0"),
+        (CHEETAH, {"front": -0.1}, "front and back are -0.1"),
+        (CHEETAH, {"back": float("nan")}, "front and back are 1.0 and nan"),
+        (HOPPER, {"friction": 1.0}, "does not take the dynamics.*friction"),
     ],
 )
-def test_bad_environments_are_refused(env_id, dynamics, error, message):
-    with pytest.raises(error, match=message):
+def test_bad_environments_are_refused(env_id, dynamics, message):
+    with pytest.raises(ValueError, match=message):
         make_batch(env_id, dynamics, 1)

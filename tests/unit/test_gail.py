@@ -13,7 +13,9 @@ from pipeline.config import DiscriminatorConfig
 
 
 def build(demonstrations, weights, **settings):
-    return AdversarialReward(demonstrations, np.array(weights, np.float64), DiscriminatorConfig(**settings), root_seed=0)
+    return AdversarialReward(
+        demonstrations, np.array(weights, np.float64), DiscriminatorConfig(**settings), root_seed=0
+    )
 
 
 def drawn_numbers(pairs):
@@ -94,7 +96,7 @@ def test_update_raises_the_reward_of_demonstrations(demonstrations, rollout):
 
     before = margin()
     for iteration in range(20):
-        reward.update(rollouts, iteration)
+        reward.update(rollouts, iteration, 1.0)
     assert margin() > before + 0.1
 
 
@@ -105,7 +107,7 @@ def test_as_many_demonstration_pairs_as_policy_pairs_or_all(
     reward = build(demonstrations(num_states), [1.0])
     counts = []
     monkeypatch.setattr(reward.discriminator, "update", lambda shown, policy: counts.append((len(shown), len(policy))))
-    reward.update([rollout(0, num_steps=num_steps)], 0)
+    reward.update([rollout(0, num_steps=num_steps)], 0, 1.0)
     # 4 steps of 3 simulators against 39 transitions: 12 of each; 50 steps against 9 transitions: 9 draws.
     assert counts == [(expected, 3 * num_steps)]
 
@@ -114,8 +116,8 @@ def test_an_update_depends_on_the_iteration_and_not_on_what_was_drawn_before(dem
     one, two = (build(demonstrations(20, 20), [1.0, 0.5], steps_per_iteration=3) for _ in range(2))
     two.draw(17, np.random.default_rng(9))
     for iteration in range(2):
-        one.update([rollout(iteration)], iteration)
-        two.update([rollout(iteration)], iteration)
+        one.update([rollout(iteration)], iteration, 1.0)
+        two.update([rollout(iteration)], iteration, 1.0)
     assert_same_bits(one.state(), two.state())
 
 
@@ -124,26 +126,41 @@ def test_an_artificial_reward_of_the_environment_changes_nothing(demonstrations,
     poisoned = replace(plain, env_rewards=np.full_like(plain.env_rewards, np.nan))
     one, two = (build(demonstrations(20), [1.0]) for _ in range(2))
     assert_same_bits(one.rewards([plain]), two.rewards([poisoned]))
-    one.update([plain], 0)
-    two.update([poisoned], 0)
+    one.update([plain], 0, 1.0)
+    two.update([poisoned], 0, 1.0)
     assert_same_bits(one.state(), two.state())
 
 
 def test_state_restores_another_instance(demonstrations, rollout, assert_same_bits):
     one = build(demonstrations(20), [1.0])
-    one.update([rollout(0)], 0)
+    one.update([rollout(0)], 0, 1.0)
     two = AdversarialReward(demonstrations(20), np.ones(1), DiscriminatorConfig(), root_seed=0)
     two.load_state({name: value.clone() for name, value in one.state().items()})
     for iteration in (1, 2):
-        one.update([rollout(iteration)], iteration)
-        two.update([rollout(iteration)], iteration)
+        one.update([rollout(iteration)], iteration, 1.0)
+        two.update([rollout(iteration)], iteration, 1.0)
     assert_same_bits(one.state(), two.state())
 
 
 def test_loading_a_state_does_not_tie_two_instances_together(demonstrations, rollout, assert_same_bits):
     one, two = (build(demonstrations(20), [1.0]) for _ in range(2))
-    one.update([rollout(0)], 0)
+    one.update([rollout(0)], 0, 1.0)
     two.load_state(one.state())
     kept = {name: value.clone() for name, value in one.state().items()}
-    two.update([rollout(1)], 1)
+    two.update([rollout(1)], 1, 1.0)
     assert_same_bits(one.state(), kept)
+
+
+def test_step_size_anneals_with_what_remains(demonstrations, rollout):
+    """Adam's first step moves each parameter by about its step size, whatever the gradient."""
+
+    def moved(remaining, anneal):
+        reward = build(demonstrations(20), [1.0], learning_rate=1e-2, anneal=anneal)
+        before = [p.detach().clone() for p in reward.discriminator.parameters()]
+        reward.update([rollout(0)], 0, remaining)
+        after = reward.discriminator.parameters()
+        return max(float((a.detach() - b).abs().max()) for a, b in zip(after, before, strict=True))
+
+    assert moved(1.0, anneal=True) == pytest.approx(1e-2, rel=1e-2)
+    assert moved(0.25, anneal=True) == pytest.approx(0.25e-2, rel=1e-2)
+    assert moved(0.25, anneal=False) == pytest.approx(1e-2, rel=1e-2)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pipeline.artifacts import Artifact, RunDirectory, encode_arrays, encode_json, write_artifact
 from pipeline.config import parse_config
 from pipeline.report import write_report
+from pipeline.report.collection import Collection, Source
 from pipeline.report.figures import source_looks
-from pipeline.report.page import Collection, Source
 from pipeline.results import Results, summary
 from pipeline.stage import Run
 
@@ -454,8 +454,8 @@ def test_stage_times_are_those_of_the_last_run(tmp_path: Path) -> None:
     run = new_run(tmp_path, ["a"], [3])
     lines = [
         {"event": "stage_finished", "stage": "clustering", "seconds": 50.0},
-        {"event": "stage_reused", "stage": "clustering", "seconds": 0.0},
         {"event": "stage_finished", "stage": "clustering", "seconds": 30.0},
+        {"event": "stage_failed", "stage": "clustering", "seconds": 7.0},
     ]
     run.directory.events.write_text("\n".join(map(json.dumps, lines)))
     assert Results(run).seconds() == {"clustering": 30.0}

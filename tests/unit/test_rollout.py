@@ -69,7 +69,9 @@ def test_a_result_does_not_change_when_the_simulators_move_on(unit, assert_same_
     ],
 )
 def test_what_a_unit_names_matters(unit, change):
-    assert collect(replace(unit, **change)).rollout.observations.tobytes() != collect(unit).rollout.observations.tobytes()
+    assert (
+        collect(replace(unit, **change)).rollout.observations.tobytes() != collect(unit).rollout.observations.tobytes()
+    )
 
 
 def test_two_halves_are_the_whole(idle_policy, assert_same_bits):

@@ -13,9 +13,9 @@ from pipeline.algorithms.trpo import Trpo, conjugate_gradient
 from pipeline.config import TrpoConfig
 
 
-def improve(policy, config, observations, actions, log_probs, advantages):
-    """One update; the generator and the remaining share of the training do not matter to TRPO."""
-    return Trpo(policy, config).update(observations, actions, log_probs, advantages, torch.Generator(), 1.0)
+def improve(policy, config, observations, actions, log_probs, advantages, remaining=1.0):
+    """One update; TRPO draws nothing from the generator."""
+    return Trpo(policy, config).update(observations, actions, log_probs, advantages, torch.Generator(), remaining)
 
 
 def parameters_of(policy):
@@ -80,7 +80,9 @@ def test_fisher_product_is_the_second_derivative_of_the_divergence(network, batc
     expected = hessian(divergence)(parameters_of(policy).clone())
     improve(policy, TrpoConfig(damping=0.07), observations, actions, log_probs, advantages)
     fisher = torch.stack(columns, dim=1)
-    torch.testing.assert_close(fisher, expected + 0.07 * torch.eye(len(expected), dtype=expected.dtype), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(
+        fisher, expected + 0.07 * torch.eye(len(expected), dtype=expected.dtype), rtol=1e-9, atol=1e-12
+    )
 
 
 def test_step_equals_stable_baselines3(network, batch):
@@ -95,7 +97,7 @@ def test_step_equals_stable_baselines3(network, batch):
         n_steps=size,
         batch_size=size,
         cg_max_steps=100,  # to convergence: it starts from random noise, we start from zero
-        # It averages the divergence over the action dimensions too, so its Fisher matrix and region are a third of ours.
+        # It averages the divergence over the action dimensions too: its Fisher matrix and region are a third of ours.
         cg_damping=0.1 / 3,
         target_kl=0.01 / 3,
         normalize_advantage=False,
@@ -147,12 +149,40 @@ def test_step_improves_and_stays_within_the_region(network, batch, max_kl):
     assert metrics["entropy"] == pytest.approx(entropy, rel=1e-5)
 
 
-def test_a_step_that_leaves_the_region_is_halved(network, batch):
-    """With a vast region the quadratic model is wrong, so the full step diverges further than allowed."""
+def test_a_step_that_does_not_improve_enough_is_halved(network, batch):
     policy = network()
-    data = batch(policy, 200)
-    metrics = improve(policy, TrpoConfig(max_kl=3.0), *data)
+    metrics = improve(policy, TrpoConfig(max_kl=3.0), *batch(policy, 200))
     assert metrics["step_fraction"] in {0.5**k for k in range(1, 10)}
+
+
+def test_a_step_that_leaves_the_region_is_halved(network, batch):
+    """Little noise is good here, so the step shrinks the deviation, where divergence grows faster than its model.
+
+    The full step improves, and only its divergence (8.0 for a region of 3) speaks against it.
+    """
+    policy, before = network(), network()
+    observations, actions, log_probs, _ = batch(policy, 200)
+    with torch.no_grad():
+        noise = (actions - policy(observations)) * torch.exp(-policy.log_std)
+    advantages = -noise.square().sum(-1)
+    advantages = (advantages - advantages.mean()) / advantages.std()
+    metrics = improve(policy, TrpoConfig(max_kl=3.0), observations, actions, log_probs, advantages)
+    assert metrics["step_fraction"] == 0.5
+    assert mean_kl(policy, before, observations) <= 1.5 * 3.0
+
+
+def test_the_region_shrinks_with_what_remains(network, batch):
+    """The step is proportional to the root of the region, so a quarter of it halves the step."""
+
+    def moved(remaining, anneal):
+        policy = network()
+        before = parameters_of(policy)
+        improve(policy, TrpoConfig(max_kl=1e-4, anneal=anneal), *batch(policy, 200), remaining=remaining)
+        return float((parameters_of(policy) - before).norm())
+
+    full = moved(1.0, anneal=True)
+    assert moved(0.25, anneal=True) == pytest.approx(full / 2, rel=1e-3)
+    assert moved(0.25, anneal=False) == pytest.approx(full, rel=1e-6)
 
 
 def test_step_is_refused_when_no_point_improves_enough(network, batch):

@@ -1,0 +1,140 @@
+"""Bad input: one clear message and exit code 2, before any work starts."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.numpy
+import yaml
+from typer.testing import CliRunner
+
+from orchestrator import app
+from pipeline.data import Demonstrations
+from pipeline.datasets import encode_demonstrations
+from tests.runs import MICRO, ROOT
+
+HOPPER = "oodil/Hopper-v0"
+
+
+def refused(*arguments: str) -> str:
+    """Return the message of a command that must exit with code 2."""
+    result = CliRunner().invoke(app, list(arguments))
+    assert result.exit_code == 2, (result.exit_code, result.output, result.exception)
+    return result.output
+
+
+def arrays(lengths: tuple[int, ...] = (5, 4), dim: int = 12) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {
+        "observations": rng.standard_normal((sum(lengths), dim), dtype=np.float32),
+        "offsets": np.cumsum([0, *lengths]).astype(np.int64),
+    }
+
+
+@pytest.fixture
+def config_for(tmp_path: Path):
+    """Return a function that writes a configuration for a file of demonstrations."""
+
+    def write(content: bytes) -> tuple[Path, Path]:
+        values = yaml.safe_load(MICRO.read_text())
+        values["demonstrations"] = {"file": "given.safetensors"}
+        values["baselines"] = []
+        (tmp_path / "given.safetensors").write_bytes(content)
+        (tmp_path / "config.yaml").write_text(yaml.safe_dump(values))
+        return tmp_path / "config.yaml", tmp_path / "given.safetensors"
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("clustering.num_cluster=3", "unknown key 'clustering.num_cluster'; did you mean 'num_clusters'?"),
+        ("sed=3", "unknown key 'sed'; did you mean 'seed'?"),
+        ("imitation.gail.generator.max_kll=1", "did you mean 'max_kl'?"),
+        ("seed=soon", "seed: Input should be a valid integer"),
+        ("clustering.temperature=-1", "clustering.temperature: Input should be greater than 0, got -1"),
+        ("environment.id=oodil/Hoper-v0", "oodil/Hoper-v0"),
+        ("environment={id: CartPole-v1}", "no batched form"),
+        ("environment.dynamics.gravty=9", "gravty"),
+        ("environment.dynamics.gravity=-9", "gravity is -9.0; it must be positive"),
+        ("nonsense", "not of the form key=value"),
+    ],
+)
+def test_configuration(tmp_path: Path, override: str, message: str) -> None:
+    output = refused("run", str(MICRO), override, "--run-dir", str(tmp_path / "run"))
+    assert message in output
+    assert len(output.strip().splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_configuration_file_that_is_missing_or_no_mapping(tmp_path: Path) -> None:
+    assert "nowhere.yaml: No such file" in refused("run", str(tmp_path / "nowhere.yaml"))
+    (tmp_path / "list.yaml").write_text("- 1\n")
+    assert "expected a mapping" in refused("run", str(tmp_path / "list.yaml"))
+
+
+def test_missing_expert(tmp_path: Path) -> None:
+    shutil.copy(MICRO, tmp_path / "micro.yaml")
+    assert "no expert is saved here" in refused("run", str(tmp_path / "micro.yaml"), "--run-dir", str(tmp_path / "run"))
+
+
+def with_nan() -> bytes:
+    made = arrays()
+    made["observations"][6, 3] = np.nan
+    return safetensors.numpy.save(made)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (safetensors.numpy.save(arrays())[:-30], "truncated"),
+        (b"", "truncated"),
+        (with_nan(), "demonstration 1 has the value nan in state 1"),
+        (safetensors.numpy.save(arrays(dim=11)), "states have 11 dimensions; environment oodil/Hopper-v0 has 12"),
+        (safetensors.numpy.save(arrays((5, 1))), "demonstration 1 has 1 state(s); a transition needs at least 2"),
+        (safetensors.numpy.save({"observations": arrays()["observations"]}), "has no array 'offsets'"),
+    ],
+)
+def test_demonstration_files(config_for, tmp_path: Path, content: bytes, message: str) -> None:
+    config, file = config_for(content)
+    output = refused("run", str(config), "--run-dir", str(tmp_path / "run"))
+    assert message in output and str(file) in output
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_file_recorded_in_another_environment(config_for, tmp_path: Path) -> None:
+    made = arrays()
+    recorded = Demonstrations(
+        **made, sources=np.zeros(2, np.int32), source_labels=("other",), returns=np.full(2, np.nan)
+    )
+    config, _ = config_for(encode_demonstrations(recorded, "oodil/Walker2d-v0"))
+    assert "recorded in oodil/Walker2d-v0" in refused("run", str(config), "--run-dir", str(tmp_path / "run"))
+
+
+def test_a_run_directory_of_another_run(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    (run_dir / "thesis.tex").write_text("not ours")
+    assert "is not empty and not a run" in refused("run", str(MICRO), "--run-dir", str(run_dir))
+    shutil.rmtree(run_dir)
+    result = CliRunner().invoke(
+        app, ["run", str(MICRO), "--run-dir", str(run_dir), "--workers", "0", "--until", "demonstrations"]
+    )
+    assert result.exit_code == 0, result.output
+    assert "holds a run with seed 0, not 1" in refused("run", str(MICRO), "seed=1", "--run-dir", str(run_dir))
+    smoke = str(ROOT / "configs" / "smoke.yaml")
+    assert 'holds a run with name "micro", not "smoke"' in refused("run", smoke, "--run-dir", str(run_dir))
+    assert "no stage 'clustring'" in refused("resume", str(run_dir), "--until", "clustring")
+    described = json.loads(CliRunner().invoke(app, ["status", str(run_dir), "--json"]).output)
+    assert described["stages"]["demonstrations"]["state"] == "done"
+    assert described["stages"]["imitation"]["state"] == "pending"
+    shown = CliRunner().invoke(app, ["demos", "inspect", str(run_dir)]).output
+    assert "7 demonstrations" in shown and "fast" in shown and "slow" in shown
+
+
+def test_what_is_no_run(tmp_path: Path) -> None:
+    for command in ("status", "resume", "report", "evaluate"):
+        assert "is not a run" in refused(command, str(tmp_path))
