@@ -10,16 +10,20 @@ import safetensors.numpy
 from pipeline.data import DataError, Demonstrations
 
 SCHEMA = "1"
+_HEADER = "oodil"
 _DTYPES = {"observations": np.float32, "offsets": np.int64, "sources": np.int32, "returns": np.float64}
 
 
 def encode_demonstrations(demonstrations: Demonstrations, environment_id: str) -> bytes:
     """Return the file's bytes."""
     arrays = {name: np.ascontiguousarray(getattr(demonstrations, name)) for name in _DTYPES}
-    labels = json.dumps(list(demonstrations.source_labels))
-    return safetensors.numpy.save(
-        arrays, metadata={"schema": SCHEMA, "environment": environment_id, "source_labels": labels}
-    )
+    header = {
+        "schema": SCHEMA,
+        "environment": environment_id,
+        "source_labels": list(demonstrations.source_labels),
+    }
+    # One entry only: safetensors writes several in no fixed order, and equal sets must be equal files.
+    return safetensors.numpy.save(arrays, metadata={_HEADER: json.dumps(header)})
 
 
 def read_demonstrations(path: Path) -> tuple[Demonstrations, str]:
@@ -41,11 +45,12 @@ def decode_demonstrations(content: bytes, origin: str) -> tuple[Demonstrations, 
         header_size = int.from_bytes(content[:8], "little")
         metadata = json.loads(content[8 : 8 + header_size]).get("__metadata__", {})
         arrays = safetensors.numpy.load(content)
-        labels = json.loads(metadata.get("source_labels", '["demonstrations"]'))
-    except (safetensors.SafetensorError, ValueError, AttributeError) as error:
+        header = {"schema": SCHEMA, "environment": "", "source_labels": ["demonstrations"]}
+        header |= json.loads(metadata.get(_HEADER, "{}"))
+    except (safetensors.SafetensorError, ValueError, AttributeError, TypeError) as error:
         raise DataError(f"{origin}: not a sound safetensors file, truncated perhaps ({error})") from error
-    if metadata.get("schema", SCHEMA) != SCHEMA:
-        raise DataError(f"{origin}: schema {metadata['schema']}; this version reads schema {SCHEMA}")
+    if header["schema"] != SCHEMA:
+        raise DataError(f"{origin}: schema {header['schema']}; this version reads schema {SCHEMA}")
     for name in ("observations", "offsets"):
         if name not in arrays:
             raise DataError(f"{origin}: has no array {name!r}")
@@ -56,7 +61,7 @@ def decode_demonstrations(content: bytes, origin: str) -> tuple[Demonstrations, 
         if arrays[name].dtype != dtype:
             raise DataError(f"{origin}: array {name!r} is {arrays[name].dtype}; expected {np.dtype(dtype)}")
     try:
-        demonstrations = Demonstrations(source_labels=tuple(labels), **{name: arrays[name] for name in _DTYPES})
+        demonstrations = Demonstrations(source_labels=tuple(header["source_labels"]), **{name: arrays[name] for name in _DTYPES})
     except DataError as error:
         raise DataError(f"{origin}: {error}") from error
-    return demonstrations, str(metadata.get("environment", ""))
+    return demonstrations, str(header["environment"])

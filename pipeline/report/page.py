@@ -199,11 +199,18 @@ def _notes(results: Results, collection: Collection | None) -> str:
             "It is not known of every source whether it is transferable, so there is no AUROC and no transferable "
             "share to judge the scores by."
         )
+    scores = results.json("transferability", "summary.json")
+    before, after = scores.get("transferable_share_before"), scores.get("transferable_share")
+    if before is not None and after is not None and after <= before:
+        notes.append(
+            "Weighting did not raise the transferable share: the scores do not favour what is transferable. Jobs that "
+            "are too short are the usual cause."
+        )
     stability = results.json("clustering", "diagnostics.json").get("label_stability")
     if stability is not None and stability < UNSTABLE_LABELS:
         notes.append(
-            f"Clusters are unstable: only {pieces.percent(stability)} of the demonstrations keep theirs when other parts of "
-            "them are drawn."
+            f"Clusters are unstable: only {pieces.percent(stability)} of the demonstrations keep theirs when other "
+            "parts of them are drawn."
         )
     if not notes:
         return ""
@@ -221,8 +228,8 @@ def _learning_section(results: Results) -> str:
         return pieces.section("The policy", pieces.missing("No policy has been trained yet."))
     episodes = results.run.config.imitation.gail.evaluation_episodes
     caption = (
-        f"True return of the deterministic policy in the imitator's environment, {pieces.plural(episodes, 'episode')} at "
-        "each point; the bands are one standard deviation of the episodes. The return is never used for learning. "
+        f"True return of the deterministic policy in the imitator's environment, {pieces.plural(episodes, 'episode')} "
+        "at each point; the bands are one standard deviation of the episodes. The return is never used for learning. "
     )
     if oracle is not None:
         caption += "Dashed: the final return of the oracle, which imitates only what is known to be transferable."
@@ -292,9 +299,12 @@ def _source_table(
     for source, own_return, share_before, share_after in columns:
         known = {True: "yes", False: "no", None: "not known"}[source.transferable]
         cells = (
-            str(source.count), pieces.returned(own_return) or "–", pieces.number(mean_scores.get(source.label), 3) or "–",
-            pieces.percent(share_before), pieces.percent(share_after),
-        )  # fmt: skip
+            str(source.count),
+            pieces.returned(own_return) or "–",
+            pieces.number(mean_scores.get(source.label), 3) or "–",
+            pieces.percent(share_before),
+            pieces.percent(share_after),
+        )
         numbers = "".join(f'<td class="number">{cell}</td>' for cell in cells)
         rows += f"<tr><th>{pieces.name(source)}</th><td>{known}</td>{numbers}</tr>\n"
     titles = ("demonstrations", "return in its own dynamics", "mean transferability", "share before", "share after")

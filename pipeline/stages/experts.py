@@ -1,7 +1,8 @@
 """Training the experts of a configuration: a stage of its own, run by ``oodil demos collect --train`` alone.
 
-A training that gets stuck is started again with the next seed, until its episodes last. This selection, like the
-training itself, uses the true reward, as making a demonstrator does; no later stage sees it.
+Each source gets two independent trainings, and the one with the higher sampled return is kept; one that falls has a
+low one. This selection, like the training itself, uses the true reward, as making a demonstrator does; no later stage
+sees it.
 """
 
 from typing import Any
@@ -15,11 +16,9 @@ from pipeline.seeding import derive_key
 from pipeline.stage import JobContext, Run, Stage
 from pipeline.versions import library_versions
 
-MAX_TRAININGS = 4
-"""Seeds tried per source; the best is kept if none lasts."""
+TRAININGS = 2
+"""Seeds tried per source."""
 EVALUATION_EPISODES = 64
-REQUIRED_FULL_SHARE = 0.95
-"""Share of sampled episodes that must last to the time limit."""
 
 
 class ExpertsStage(Stage):
@@ -39,37 +38,42 @@ class ExpertsStage(Stage):
         return {"environment": config.environment.id, "sources": sources, "training": training}
 
     def jobs(self, run: Run) -> list[str]:
-        """Return a job per source."""
-        return [f"source-{i}" for i in range(len(run.config.demonstrations.sources))]
+        """Return a job per source and seed."""
+        sources = range(len(run.config.demonstrations.sources))
+        return [_job(i, seed) for i in sources for seed in range(run.config.seed, run.config.seed + TRAININGS)]
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
-        """Train until episodes last, and say what the expert reaches with sampled and with mean actions."""
-        source = run.config.demonstrations.sources[int(job.removeprefix("source-"))]
+        """Train one expert and say what it reaches with sampled and with mean actions."""
+        _, index, _, seed = job.split("-")
+        source = run.config.demonstrations.sources[int(index)]
         environment = EnvironmentConfig(id=run.config.environment.id, dynamics=source.dynamics)
         training = EXPERT_TRAINING.model_copy(update={"discount": source.expert_discount})
-        best: tuple[float, Files] = (-1.0, {})
-        for seed in range(run.config.seed, run.config.seed + MAX_TRAININGS):
-            policy = train_expert(environment, training, seed, context, self.checkpoints(run, f"{job}-seed-{seed}"))
-            reached = _reached(policy, environment, seed)
-            described = {"environment": environment.model_dump(), "training": training.model_dump(mode="json")}
-            share = reached["stochastic"]["full_length_share"]
-            if share > best[0]:
-                best = share, expert_files(policy, described | reached | {"seed": seed})
-            if share >= REQUIRED_FULL_SHARE:
-                break
-            context.warn(f"{source.label}, seed {seed}: only {share:.0%} of sampled episodes last")
-        return best[1]
+        policy = train_expert(environment, training, int(seed), context, self.checkpoints(run, job))
+        described = {
+            "environment": environment.model_dump(),
+            "training": training.model_dump(mode="json"),
+            "seed": int(seed),
+        }
+        return expert_files(policy, described | _reached(policy, environment, int(seed)))
 
     def combine(self, run: Run) -> Files:
-        """List the experts."""
-        labels = [source.label for source in run.config.demonstrations.sources]
-        return {"experts.json": encode_json(dict(zip(self.jobs(run), labels, strict=True)))}
+        """Choose the better training of each source."""
+        chosen = {}
+        for i, source in enumerate(run.config.demonstrations.sources):
+            returns = {
+                job: run.job_artifact(self.name, job).json("expert.json")["stochastic"]["return_mean"]
+                for job in self.jobs(run)
+                if job.startswith(f"source-{i}-")
+            }
+            chosen[source.label] = max(returns, key=lambda job: returns[job])
+        return {"chosen.json": encode_json(chosen)}
 
     def export(self, run: Run) -> list[str]:
         """Save each source's expert in its folder; return a line about each."""
+        chosen = run.artifact(self.name).json("chosen.json")
         lines = []
-        for job, source in zip(self.jobs(run), run.config.demonstrations.sources, strict=True):
-            trained = run.job_artifact(self.name, job)
+        for source in run.config.demonstrations.sources:
+            trained = run.job_artifact(self.name, chosen[source.label])
             files = {name: trained.read(name) for name in trained.hashes}
             write_artifact(source.expert, {"expert": source.dynamics}, files, library_versions())
             reached = trained.json("expert.json")["stochastic"]
@@ -78,6 +82,10 @@ class ExpertsStage(Stage):
                 f"{reached['full_length_share']:.0%} of sampled episodes last -> {source.expert}"
             )
         return lines
+
+
+def _job(source: int, seed: int) -> str:
+    return f"source-{source}-seed-{seed}"
 
 
 def _reached(policy: GaussianPolicy, environment: EnvironmentConfig, seed: int) -> dict[str, dict[str, float]]:

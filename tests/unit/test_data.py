@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.data import DataError, Demonstrations
+from pipeline.datasets import decode_demonstrations, encode_demonstrations
 
 
 def make(lengths=(3, 2, 4), **changes):
@@ -80,3 +81,13 @@ def test_bad_demonstrations_are_refused(changes, message):
 def test_nothing_selected_is_refused():
     with pytest.raises(DataError, match="no demonstration"):
         make().select(np.array([], np.int64))
+
+
+def test_equal_demonstrations_are_equal_files(demonstrations):
+    made = demonstrations(4, 3)
+    files = {encode_demonstrations(made, "oodil/Hopper-v0") for _ in range(20)}
+    assert len(files) == 1
+    read, environment = decode_demonstrations(files.pop(), "here")
+    assert environment == "oodil/Hopper-v0" and read.source_labels == made.source_labels
+    assert read.observations.tobytes() == made.observations.tobytes()
+    assert read.offsets.tolist() == made.offsets.tolist()

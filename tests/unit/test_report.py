@@ -418,6 +418,17 @@ def test_weak_evaluations_are_called_weak(tmp_path: Path) -> None:
     assert "imitation 5 M, naive GAIL 1 M, oracle 5 M environment steps" in text
 
 
+def test_scores_that_favour_the_wrong_sources_are_called_out(tmp_path: Path, full: tuple[Run, Page]) -> None:
+    told = "Weighting did not raise the transferable share"
+    assert told not in full[1].text
+    run = full_run(tmp_path, **SMALL)
+    arrays = run.artifact("transferability").arrays("transferability.safetensors")
+    worse = {"auroc": 0.2, "transferable_share": 0.1, "transferable_share_before": 0.3}
+    files = {"transferability.safetensors": arrays, "summary.json": worse}
+    Writer(run, **SMALL).write("transferability", files, ("demonstrations", "clustering"))
+    assert told in render(run).text
+
+
 def test_shares_of_the_sampling_mass_count_transitions() -> None:
     looks = source_looks([True, False])
     sources = [Source("a", True, 1, looks[0]), Source("b", False, 2, looks[1])]
