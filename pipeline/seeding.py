@@ -18,9 +18,14 @@ def derive_key(root_seed: int, *path: str | int) -> Key:
 
 def generator(key: Key) -> np.random.Generator:
     """Return a fresh generator for a key; the same key always starts the same stream."""
-    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key)))
+    return np.random.Generator(np.random.PCG64(_sequence(key)))
 
 
 def torch_seed(key: Key) -> int:
     """Return a 63-bit seed for ``torch.Generator.manual_seed``."""
-    return int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1)
+    return int(_sequence(key).generate_state(1, np.uint64)[0] >> 1)
+
+
+def _sequence(key: Key) -> np.random.SeedSequence:
+    # As entropy, NumPy would pad the key with zeros, and a path would share its stream with the same path and a zero.
+    return np.random.SeedSequence(key[0], spawn_key=key[1:])
