@@ -1,8 +1,8 @@
 """How much experience GAIL needs: ten demonstrations of gravity 9.8, an imitator under gravity 12.0, five seeds.
 
-For every seed: environment steps and seconds until the deterministic policy first reaches a return of 2,900, and the return
-at the end of the budget. Run it as ``python benchmarks/gail_reference.py --json FILE``; ``--setting official`` takes the
-constants of the method's released code instead of the defaults.
+For every seed: environment steps and seconds until the deterministic policy first reaches a return of 2,900, and the
+return at the end of the budget. ``python benchmarks/gail_reference.py --json FILE`` runs it; ``--setting official`` takes
+the constants of the method's released code instead of the defaults.
 """
 
 import argparse

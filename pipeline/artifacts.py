@@ -199,7 +199,7 @@ class Checkpoints:
 
     def load(self) -> tuple[dict[str, NDArray] | None, list[str]]:
         """Return the newest sound state of a job with this origin, or None, and a warning for each damaged one."""
-        warnings = []
+        warnings: list[str] = []
         for path in reversed(self._paths()):
             try:
                 checkpoint = read_artifact(path)

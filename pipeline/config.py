@@ -128,7 +128,7 @@ class TrainingConfig(_Section):
     """How the policy is improved."""
     value: ValueConfig = ValueConfig()
     """The value function."""
-    num_evaluations: int = Field(12, ge=0)
+    num_evaluations: int = Field(default=12, ge=0)
     """Points of the learning curve; each is the deterministic policy on fresh episodes. Never used for learning."""
     evaluation_episodes: PositiveInt = 8
     """Episodes per point of the curve."""
@@ -205,7 +205,7 @@ class ClusteringConfig(_Section):
 
     num_clusters: PositiveInt = 5
     """K at initialisation; clusters may end up empty. With 1 there is nothing to train."""
-    subtrajectory_length: int = Field(20, ge=2)
+    subtrajectory_length: int = Field(default=20, ge=2)
     """States per sub-trajectory."""
     sampling: Literal["fixed_length", "fixed_stride"] = "fixed_length"
     """Whether ``subtrajectory_length`` counts states (appendix) or is the stride between them (official code)."""
@@ -213,17 +213,17 @@ class ClusteringConfig(_Section):
     """Width of the LSTM, and of the embedding."""
     temperature: PositiveFloat = 1.0
     """Divides the cosine similarities."""
-    centre_weight: float = Field(0.01, ge=0.0)
+    centre_weight: float = Field(default=0.01, ge=0.0)
     """Lambda: weight of the distance to the centres."""
     reduction: Literal["sum", "mean"] = "sum"
     """How that distance is reduced over the 2B sub-trajectories of a batch."""
     learning_rate: PositiveFloat = 0.01
     """Adam's step size."""
-    weight_decay: float = Field(0.0, ge=0.0)
+    weight_decay: float = Field(default=0.0, ge=0.0)
     """Adam's weight decay."""
-    warmup_iterations: int = Field(200, ge=0)
+    warmup_iterations: int = Field(default=200, ge=0)
     """Iterations with the contrastive loss alone."""
-    joint_iterations: int = Field(2000, ge=0)
+    joint_iterations: int = Field(default=2000, ge=0)
     """Iterations with both losses."""
     batch_size: PositiveInt = 128
     """Demonstrations per iteration; all of them if there are fewer."""
@@ -269,11 +269,11 @@ class TransferabilityConfig(_Section):
 
     gail: GailConfig
     """Training of each job."""
-    num_scores: int = Field(100, ge=2)
+    num_scores: int = Field(default=100, ge=2)
     """Times the demonstrations are scored while a job runs, evenly spaced."""
     averaged_scores: PositiveInt = 20
     """How many of the last scores are averaged."""
-    sharpening: float = Field(2.0, gt=0.0)
+    sharpening: float = Field(default=2.0, gt=0.0)
     """Power to which a transferability is raised to become a weight; 1 is the paper's form (docs/decisions.md)."""
 
 
@@ -292,9 +292,9 @@ Baseline = Literal["naive_gail", "oracle"]
 class RuntimeConfig(_Section):
     """How it runs. Nothing here changes a result, so nothing here is part of a fingerprint."""
 
-    workers: int = Field(2, ge=0)
+    workers: int = Field(default=2, ge=0)
     """Parallel processes; 0 runs everything in the orchestrator's own."""
-    checkpoint_interval_s: float = Field(20.0, ge=0.0)
+    checkpoint_interval_s: float = Field(default=20.0, ge=0.0)
     """Seconds between checkpoints of a job; 0 checkpoints every iteration."""
     unit_timeout_s: PositiveFloat = 30.0
     """Seconds after which a unit of work is given to another rollout worker."""
@@ -302,7 +302,7 @@ class RuntimeConfig(_Section):
     """Starts of a job before it counts as failed."""
     max_worker_restarts: PositiveInt = 20
     """Restarts of rollout workers in one stage before it counts as failed."""
-    restart_delay_s: float = Field(0.5, ge=0.0)
+    restart_delay_s: float = Field(default=0.5, ge=0.0)
     """Pause before the first restart; it doubles with each further one, up to 10 s."""
 
 
@@ -311,7 +311,7 @@ class RunConfig(_Section):
 
     name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
     """Name of the run and of its default folder."""
-    seed: int = Field(0, ge=0)
+    seed: int = Field(default=0, ge=0)
     """Root of all randomness."""
     environment: EnvironmentConfig
     """The imitator's environment."""

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -13,6 +14,9 @@ from numpy.typing import NDArray
 from pipeline.environments import MujocoBatch, make_batch
 from pipeline.policy import GaussianPolicy
 from pipeline.seeding import Key, generator
+
+FILM_EVERY = 4
+"""Steps between frames; the environments run at 125 and 20 steps per second of simulated time."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,7 @@ def run_episodes(
     returns, lengths = np.zeros(count), np.zeros(count, np.int64)
     std = np.exp(policy.log_std)
     while not lengths.all():
-        actions = policy.mean(simulators.observations())
+        actions: NDArray[np.floating] = policy.mean(simulators.observations())
         if stochastic:
             actions = actions + std * rng.standard_normal(actions.shape, dtype=np.float32)
         outcome = simulators.step(actions)
@@ -79,19 +83,22 @@ def film(policy: GaussianPolicy, env_id: str, dynamics: Mapping[str, float], see
     """
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
-    import imageio.v2 as imageio
+    import imageio.v3 as imageio
 
     try:
-        env = gymnasium.make(env_id, render_mode="rgb_array", **dynamics)
+        arguments: dict[str, Any] = {"render_mode": "rgb_array", **dynamics}
+        env = gymnasium.make(env_id, **arguments)
         observation, _ = env.reset(seed=seed)
-        with imageio.get_writer(path, fps=env.metadata["render_fps"] // 4, macro_block_size=None) as video:
-            env_return, ended, step = 0.0, False, 0
-            while not ended:
-                if step % 4 == 0:
-                    video.append_data(env.render())
-                observation, reward, terminated, truncated, _ = env.step(policy.mean(observation[None])[0])
-                env_return, ended, step = env_return + float(reward), terminated or truncated, step + 1
+        frames: list[Any] = []
+        env_return, ended, step = 0.0, False, 0
+        while not ended:
+            if step % FILM_EVERY == 0:
+                frames.append(env.render())
+            observation, reward, terminated, truncated, _ = env.step(policy.mean(observation[None])[0])
+            env_return, ended, step = env_return + float(reward), terminated or truncated, step + 1
+        fps = env.metadata["render_fps"] / FILM_EVERY
         env.close()
+        imageio.imwrite(path, np.stack(frames), fps=fps)
     except (ImportError, RuntimeError, AttributeError, gymnasium.error.Error) as error:
         raise OSError(
             f"cannot render here ({error}); a machine without a display needs EGL or OSMesa "

@@ -47,9 +47,10 @@ class AdversarialReward:
 
     def state_moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return mean and standard deviation (S,) of the demonstrations' states as they are weighted."""
-        mean = np.average(self._observations, axis=0, weights=self._state_weights)
-        variance = np.average(np.square(self._observations - mean), axis=0, weights=self._state_weights)
-        return mean, np.sqrt(variance)
+        states = self._observations.astype(np.float64)
+        mean = np.average(states, axis=0, weights=self._state_weights)
+        variance = np.average(np.square(states - mean), axis=0, weights=self._state_weights)
+        return np.asarray(mean), np.sqrt(variance)
 
     @torch.no_grad()
     def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:

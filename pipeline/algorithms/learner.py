@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pipeline.algorithms.advantages import generalised_advantages, standardised
 from pipeline.algorithms.networks import PolicyNetwork
+from pipeline.algorithms.optimiser import Adam
 from pipeline.algorithms.ppo import Ppo
 from pipeline.algorithms.trpo import Trpo
 from pipeline.algorithms.value import ValueFunction
@@ -185,5 +186,5 @@ class Learner:
         for name, part in self._parts().items():
             part.load_state(below(name))
 
-    def _parts(self) -> dict[str, "RewardModel | Trpo | Ppo"]:
+    def _parts(self) -> dict[str, RewardModel | Trpo | Ppo | Adam]:
         return {"generator": self.generator, "value_optimiser": self.value.optimiser, "reward_model": self.reward_model}

@@ -17,8 +17,9 @@ class MLP(nn.Module):
 
     def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int, rng: torch.Generator) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise((inputs, *hidden, outputs)))
-        for layer in self.layers:
+        self.layers = [nn.Linear(a, b) for a, b in pairwise((inputs, *hidden, outputs))]
+        for i, layer in enumerate(self.layers):
+            self.add_module(f"layer_{i}", layer)
             bound = layer.in_features**-0.5
             nn.init.uniform_(layer.weight, -bound, bound, generator=rng)
             nn.init.uniform_(layer.bias, -bound, bound, generator=rng)
@@ -84,7 +85,7 @@ class PolicyNetwork(nn.Module):
 
     def export(self) -> GaussianPolicy:
         """Return a copy for rollout workers."""
-        layers = list(self.net.layers)
+        layers = self.net.layers
         return GaussianPolicy(
             weights=tuple(np.ascontiguousarray(layer.weight.detach().numpy().T) for layer in layers),
             biases=tuple(layer.bias.detach().numpy().copy() for layer in layers),

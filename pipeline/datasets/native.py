@@ -61,7 +61,8 @@ def decode_demonstrations(content: bytes, origin: str) -> tuple[Demonstrations, 
         if arrays[name].dtype != dtype:
             raise DataError(f"{origin}: array {name!r} is {arrays[name].dtype}; expected {np.dtype(dtype)}")
     try:
-        demonstrations = Demonstrations(source_labels=tuple(header["source_labels"]), **{name: arrays[name] for name in _DTYPES})
+        parts = {name: arrays[name] for name in _DTYPES}
+        demonstrations = Demonstrations(source_labels=tuple(header["source_labels"]), **parts)
     except DataError as error:
         raise DataError(f"{origin}: {error}") from error
     return demonstrations, str(header["environment"])

@@ -5,6 +5,7 @@ gravity=12.0)`` imports it by itself.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import gymnasium
 
@@ -30,15 +31,17 @@ def make_batch(env_id: str, dynamics: Mapping[str, float], num_simulators: int) 
     a batched form.
     """
     try:
-        env = gymnasium.make(env_id, **dynamics)
+        arguments: dict[str, Any] = dict(dynamics)
+        env = gymnasium.make(env_id, **arguments)
     except gymnasium.error.Error as error:
         raise ValueError(f"environment {env_id!r} cannot be made: {error}") from error
     except TypeError as error:
         raise ValueError(f"environment {env_id!r} does not take the dynamics {dict(dynamics)}: {error}") from error
-    if not hasattr(env.unwrapped, "batch_healthy"):
+    task: Any = env.unwrapped
+    if not hasattr(task, "batch_healthy"):
         raise ValueError(f"environment {env_id!r} has no batched form; those that have are {', '.join(batched_ids())}")
     assert env.spec is not None and env.spec.max_episode_steps is not None
-    return MujocoBatch(env.unwrapped, num_simulators, env.spec.max_episode_steps)
+    return MujocoBatch(task, num_simulators, env.spec.max_episode_steps)
 
 
 def batched_ids() -> list[str]:

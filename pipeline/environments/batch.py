@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
-from pipeline.environments.mujoco import HalfCheetahEnv, HopperEnv, Walker2dEnv
+from pipeline.environments.mujoco import BatchedTask
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
@@ -41,9 +41,7 @@ class StepOutcome:
 class MujocoBatch:
     """G simulators of one locomotion task; the caller decides when an ended one is reset."""
 
-    def __init__(
-        self, env: HopperEnv | Walker2dEnv | HalfCheetahEnv, num_simulators: int, max_episode_steps: int
-    ) -> None:
+    def __init__(self, env: BatchedTask, num_simulators: int, max_episode_steps: int) -> None:
         self.env = env
         self.num_simulators = num_simulators
         self.max_episode_steps = max_episode_steps
@@ -94,14 +92,11 @@ class MujocoBatch:
     def _outcome(self, x_before: NDArray[np.float64], actions: NDArray[np.floating]) -> StepOutcome:
         # The order of the operations follows Gymnasium's, so that the bits do too.
         env = self.env
-        rewards = env._forward_reward_weight * ((self._qpos[:, 0] - x_before) / env.dt)
         healthy = env.batch_healthy(self._qpos, self._qvel)
-        if healthy is None:
-            terminated = np.zeros(self.num_simulators, np.bool_)
-        else:
-            rewards = rewards + healthy * env._healthy_reward
-            terminated = ~healthy if env._terminate_when_unhealthy else np.zeros(self.num_simulators, np.bool_)
+        rewards = env._forward_reward_weight * ((self._qpos[:, 0] - x_before) / env.dt)
+        rewards = rewards + healthy * env._healthy_reward
         rewards = rewards - env._ctrl_cost_weight * np.square(actions).sum(axis=1)
+        terminated = ~healthy & env._terminate_when_unhealthy
         self._elapsed += 1
         self._returns += rewards
         return StepOutcome(rewards, terminated, self._elapsed >= self.max_episode_steps)

@@ -1,11 +1,11 @@
 """Gymnasium's v5 locomotion tasks with their dynamics as keyword arguments.
 
 The observation is ``[qpos, qvel]`` with root x, as the paper's experiments use it. Dynamics are set on the compiled
-model, so no XML is copied. Each class also states its health rule and its reset noise for a whole batch of simulators at once;
-`pipeline.environments.batch` steps them and is tested to agree with these classes to the bit.
+model, so no XML is copied. Each class also states what `pipeline.environments.batch` needs to step many of them: its
+health rule for a whole batch, and how it draws the initial velocity.
 """
 
-from typing import Any
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -13,6 +13,31 @@ from gymnasium.envs.mujoco import half_cheetah_v5, hopper_v5, walker2d_v5
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+
+
+class BatchedTask(Protocol):
+    """What a locomotion task says of itself; the names with an underscore are Gymnasium's own."""
+
+    model: mujoco.MjModel
+    frame_skip: int
+    init_qpos: Floats
+    velocity_limit: float
+    """Velocities are clipped to it in the observation."""
+    _reset_noise_scale: float
+    _forward_reward_weight: float
+    _ctrl_cost_weight: float
+    _healthy_reward: float
+    _terminate_when_unhealthy: bool
+
+    @property
+    def dt(self) -> float:
+        """Seconds per control step."""
+
+    def batch_healthy(self, qpos: Floats, qvel: Floats) -> NDArray[np.bool_]:
+        """Return (G,) health of (G, nq) positions and (G, nv) velocities."""
+
+    def reset_velocity(self, rng: np.random.Generator) -> Floats:
+        """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
 
 
 class HopperEnv(hopper_v5.HopperEnv):
@@ -52,7 +77,6 @@ class Walker2dEnv(walker2d_v5.Walker2dEnv):
     """
 
     velocity_limit = 10.0
-    reset_velocity = HopperEnv.reset_velocity
 
     def __init__(self, friction: float = 1.9, **kwargs: Any) -> None:
         if not 0 < friction < np.inf:
@@ -71,6 +95,11 @@ class Walker2dEnv(walker2d_v5.Walker2dEnv):
             & (angle < self._healthy_angle_range[1])
         )
 
+    def reset_velocity(self, rng: np.random.Generator) -> Floats:
+        """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
+        scale = self._reset_noise_scale
+        return self.init_qvel + rng.uniform(low=-scale, high=scale, size=self.model.nv)
+
 
 class HalfCheetahEnv(half_cheetah_v5.HalfCheetahEnv):
     """HalfCheetah-v5 with root x in the observation and the motors of the front and back leg scaled.
@@ -79,6 +108,8 @@ class HalfCheetahEnv(half_cheetah_v5.HalfCheetahEnv):
     """
 
     velocity_limit = np.inf
+    _healthy_reward = 0.0
+    _terminate_when_unhealthy = False
 
     def __init__(self, front: float = 1.0, back: float = 1.0, **kwargs: Any) -> None:
         if not (0 <= front < np.inf and 0 <= back < np.inf):
@@ -88,9 +119,9 @@ class HalfCheetahEnv(half_cheetah_v5.HalfCheetahEnv):
             name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator)
             self.model.actuator_gear[actuator, 0] *= front if name.startswith("f") else back
 
-    def batch_healthy(self, qpos: Floats, qvel: Floats) -> None:
-        """HalfCheetah never ends an episode and pays nothing for survival."""
-        return None
+    def batch_healthy(self, qpos: Floats, qvel: Floats) -> NDArray[np.bool_]:
+        """HalfCheetah is never unhealthy, and pays nothing for it."""
+        return np.ones(len(qpos), np.bool_)
 
     def reset_velocity(self, rng: np.random.Generator) -> Floats:
         """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""

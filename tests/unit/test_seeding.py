@@ -1,7 +1,6 @@
 """Streams are named: equal names, equal streams; different names, different streams."""
 
 import numpy as np
-import pytest
 
 from pipeline.seeding import derive_key, generator, torch_seed
 
