@@ -1,7 +1,7 @@
 """How much experience GAIL needs: ten demonstrations of gravity 9.8, an imitator under gravity 12.0, five seeds.
 
 For every seed: environment steps and seconds until the deterministic policy first reaches a return of 2,900, and the
-return at the end of the budget. ``python benchmarks/gail_reference.py --json FILE`` runs it; ``--setting official`` takes
+return at the end of the budget. Run ``python benchmarks/gail_reference.py --json FILE``; ``--setting official`` takes
 the constants of the method's released code instead of the defaults.
 """
 
@@ -44,8 +44,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
     "official": {
         "normalise_observations": False,
-        "generator": {"kind": "trpo", "anneal": False},
-        "discriminator": {"anneal": False},
+        "anneal": False,
         "lag": 0,
     },
 }

@@ -48,8 +48,6 @@ class TrpoConfig(_Section):
     """Halvings of the step before it is refused."""
     accept_ratio: UnitInterval = 0.1
     """Share of the expected improvement that a step must reach."""
-    anneal: bool = True
-    """Let the trust region shrink linearly to zero over the training."""
 
 
 class PpoConfig(_Section):
@@ -68,8 +66,6 @@ class PpoConfig(_Section):
     """Gradients are scaled down to this norm."""
     entropy_bonus: float = 0.0
     """Weight of the policy's entropy."""
-    anneal: bool = True
-    """Let the step size fall linearly to zero over the training."""
 
 
 class ValueConfig(_Section):
@@ -94,8 +90,6 @@ class DiscriminatorConfig(_Section):
     """Adam's step size."""
     steps_per_iteration: PositiveInt = 1
     """Full-batch steps after each policy update."""
-    anneal: bool = True
-    """Let the step size fall linearly to zero over the training."""
 
 
 class TrainingConfig(_Section):
@@ -122,6 +116,8 @@ class TrainingConfig(_Section):
     ones). The discriminator always sees raw states."""
     scale_rewards: bool = False
     """Multiply rewards by 1 - discount, so that values are of order one."""
+    anneal: bool = True
+    """Let the steps of the policy and of the discriminator shrink linearly to zero, so that the end is settled."""
     initial_log_std: float = 0.0
     """Logarithm of the policy's initial standard deviation."""
     generator: Annotated[TrpoConfig | PpoConfig, Field(discriminator="kind")] = TrpoConfig()
@@ -268,13 +264,21 @@ class TransferabilityConfig(_Section):
     """One GAIL job per cluster, and how its discriminators are read."""
 
     gail: GailConfig
-    """Training of each job."""
+    """Training of each job. ``anneal`` is off unless it is set: a discriminator that stops learning is fooled in the
+    end, and the scores of what cannot be reproduced rise."""
     num_scores: int = Field(default=100, ge=2)
     """Times the demonstrations are scored while a job runs, evenly spaced."""
     averaged_scores: PositiveInt = 20
     """How many of the last scores are averaged."""
     sharpening: float = Field(default=2.0, gt=0.0)
     """Power to which a transferability is raised to become a weight; 1 is the paper's form (docs/decisions.md)."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _constant_steps(cls, values: Any) -> Any:
+        if isinstance(values, dict) and isinstance(values.get("gail"), dict):
+            return values | {"gail": {"anneal": False} | values["gail"]}
+        return values
 
 
 class ImitationConfig(_Section):

@@ -58,10 +58,10 @@ class AdversarialReward:
         rewards = imitation_reward(self.discriminator(_policy_pairs(rollouts))).numpy()
         return rewards.reshape(rollouts[0].terminated.shape[0], -1)
 
-    def update(self, rollouts: list[Rollout], iteration: int, remaining: float) -> dict[str, float]:
+    def update(self, rollouts: list[Rollout], iteration: int, step_scale: float) -> dict[str, float]:
         """Step the discriminator on the rollouts against as many demonstration pairs, or all of them if fewer."""
         config = self.discriminator.config
-        self.discriminator.optimiser.learning_rate = config.learning_rate * (remaining if config.anneal else 1.0)
+        self.discriminator.optimiser.learning_rate = config.learning_rate * step_scale
         policy_pairs = _policy_pairs(rollouts)
         rng = generator(derive_key(self.root_seed, "discriminator", iteration))
         count = min(len(self._starts), len(policy_pairs))

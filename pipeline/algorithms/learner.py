@@ -37,8 +37,8 @@ class RewardModel(Protocol):
     def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:
         """Return (T, G) rewards."""
 
-    def update(self, rollouts: list[Rollout], iteration: int, remaining: float) -> dict[str, float]:
-        """Learn from the iteration's rollouts and return metrics; ``remaining`` is the share of training ahead."""
+    def update(self, rollouts: list[Rollout], iteration: int, step_scale: float) -> dict[str, float]:
+        """Learn from the iteration's rollouts and return metrics; ``step_scale`` multiplies the step size."""
 
     def state(self) -> dict[str, Tensor]:
         """Return everything needed to continue."""
@@ -58,7 +58,7 @@ class EnvReward:
         """Return the (T, G) rewards of the environment."""
         return side_by_side([r.env_rewards for r in rollouts]).astype(np.float32)
 
-    def update(self, rollouts: list[Rollout], iteration: int, remaining: float) -> dict[str, float]:
+    def update(self, rollouts: list[Rollout], iteration: int, step_scale: float) -> dict[str, float]:
         """There is nothing to learn."""
         return {}
 
@@ -108,7 +108,7 @@ class Learner:
     def update(self, rollouts: list[Rollout], iteration: int) -> dict[str, float]:
         """Learn from one iteration's rollouts, given in group order, and return metrics."""
         config = self.config
-        remaining = 1 - iteration / config.num_iterations
+        step_scale = 1 - iteration / config.num_iterations if config.anneal else 1.0
         rng = torch.Generator().manual_seed(torch_seed(derive_key(self.root_seed, "learner", iteration)))
         observations = torch.from_numpy(side_by_side([r.observations for r in rollouts]))
         actions = torch.from_numpy(side_by_side([r.actions for r in rollouts]))
@@ -132,10 +132,10 @@ class Learner:
             log_probs.flatten(),
             torch.from_numpy(standardised(advantages)).flatten(),
             rng,
-            remaining,
+            step_scale,
         )
         metrics |= self.value.fit(inputs, torch.from_numpy(advantages + values).flatten(), rng)
-        metrics |= self.reward_model.update(rollouts, iteration, remaining)
+        metrics |= self.reward_model.update(rollouts, iteration, step_scale)
         return metrics
 
     @torch.no_grad()

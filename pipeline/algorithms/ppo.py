@@ -40,16 +40,16 @@ class Ppo:
         log_probs: Tensor,
         advantages: Tensor,
         rng: torch.Generator,
-        remaining: float,
+        step_scale: float,
     ) -> dict[str, float]:
         """Improve the policy on one batch of (B, S), (B, A), (B,) and (B,); minibatches are drawn with ``rng``.
 
-        ``remaining`` is the share of the training that lies ahead, 1 at its start.
+        ``step_scale`` multiplies the step size.
 
         Returns metrics: kl (of the last minibatch, estimated), entropy.
         """
         config, policy = self.config, self.policy
-        self._optimiser.learning_rate = config.learning_rate * (remaining if config.anneal else 1.0)
+        self._optimiser.learning_rate = config.learning_rate * step_scale
         kl = 0.0
         for _ in range(config.epochs):
             for chosen in torch.randperm(len(observations), generator=rng).split(config.minibatch_size):

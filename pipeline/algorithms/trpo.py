@@ -59,7 +59,7 @@ class Trpo:
         log_probs: Tensor,
         advantages: Tensor,
         rng: torch.Generator,
-        remaining: float,
+        step_scale: float,
     ) -> dict[str, float]:
         """Improve the policy on one batch.
 
@@ -68,11 +68,11 @@ class Trpo:
             log_probs: (B,) under the policy that acted; it may be one version behind.
             advantages: (B,) standardised.
             rng: unused; every generator has the same signature.
-            remaining: share of the training that lies ahead, 1 at its start.
+            step_scale: factor on the trust region.
         Returns metrics: kl, improvement, step_fraction (0 when the step was refused), entropy.
         """
         config, policy = self.config, self.policy
-        max_kl = config.max_kl * (remaining if config.anneal else 1.0)
+        max_kl = config.max_kl * step_scale
         inputs = policy.normalise(observations)
         mean = policy.net(inputs)
         surrogate = (torch.exp(policy.log_prob(mean, actions) - log_probs) * advantages).mean()

@@ -14,8 +14,10 @@ from pipeline.config import (
     OFFICIAL_CLUSTERING,
     ClusteringConfig,
     ConfigError,
+    ImitationConfig,
     PpoConfig,
     TrainingConfig,
+    TransferabilityConfig,
     TrpoConfig,
     load_config,
     parse_config,
@@ -231,3 +233,10 @@ def test_reading_a_configuration_loads_no_heavy_library():
         "assert not heavy, heavy"
     )
     subprocess.run([sys.executable, "-c", probe], check=True, cwd=ROOT)
+
+
+def test_discriminators_that_score_keep_learning_unless_told_otherwise() -> None:
+    section = {"gail": {"total_steps": 10}}
+    assert not TransferabilityConfig.model_validate(section).gail.anneal
+    assert TransferabilityConfig.model_validate({"gail": {"total_steps": 10, "anneal": True}}).gail.anneal
+    assert ImitationConfig.model_validate(section).gail.anneal

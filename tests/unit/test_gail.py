@@ -151,16 +151,15 @@ def test_loading_a_state_does_not_tie_two_instances_together(demonstrations, rol
     assert_same_bits(one.state(), kept)
 
 
-def test_step_size_anneals_with_what_remains(demonstrations, rollout):
+def test_step_scale_multiplies_the_step_size(demonstrations, rollout):
     """Adam's first step moves each parameter by about its step size, whatever the gradient."""
 
-    def moved(remaining, anneal):
-        reward = build(demonstrations(20), [1.0], learning_rate=1e-2, anneal=anneal)
+    def moved(step_scale):
+        reward = build(demonstrations(20), [1.0], learning_rate=1e-2)
         before = [p.detach().clone() for p in reward.discriminator.parameters()]
-        reward.update([rollout(0)], 0, remaining)
+        reward.update([rollout(0)], 0, step_scale)
         after = reward.discriminator.parameters()
         return max(float((a.detach() - b).abs().max()) for a, b in zip(after, before, strict=True))
 
-    assert moved(1.0, anneal=True) == pytest.approx(1e-2, rel=1e-2)
-    assert moved(0.25, anneal=True) == pytest.approx(0.25e-2, rel=1e-2)
-    assert moved(0.25, anneal=False) == pytest.approx(1e-2, rel=1e-2)
+    assert moved(1.0) == pytest.approx(1e-2, rel=1e-2)
+    assert moved(0.25) == pytest.approx(0.25e-2, rel=1e-2)

@@ -215,3 +215,22 @@ def test_sent_policies_do_not_follow_the_learner(shown):
     train(learner, 0, 1)
     for name, value in sent.arrays().items():
         np.testing.assert_array_equal(value, before[name], err_msg=name)
+
+
+@pytest.mark.parametrize(("anneal", "expected"), [(True, [1.0, 0.75, 0.5, 0.25]), (False, [1.0] * 4)])
+def test_steps_shrink_linearly_over_the_training(shown, rollout, anneal, expected):
+    class Recording(EnvReward):
+        scales: list[float] = []  # noqa: RUF012
+
+        def update(self, rollouts, iteration, step_scale):
+            self.scales.append(step_scale)
+            return {}
+
+    Recording.scales.clear()
+    config = TrainingConfig(
+        total_steps=4 * 18, num_groups=1, simulators_per_group=3, steps_per_rollout=6, policy_hidden=(8,), anneal=anneal
+    )
+    learner = Learner(3, 2, config, Recording(), 0)
+    for iteration in range(4):
+        learner.update([rollout(iteration)], iteration)
+    assert Recording.scales == expected

@@ -11,9 +11,9 @@ from pipeline.algorithms.ppo import Ppo, clipped_surrogate
 from pipeline.config import PpoConfig
 
 
-def improve(policy, config, observations, actions, log_probs, advantages, remaining=1.0):
+def improve(policy, config, observations, actions, log_probs, advantages, step_scale=1.0):
     rng = torch.Generator().manual_seed(0)
-    return Ppo(policy, config).update(observations, actions, log_probs, advantages, rng, remaining)
+    return Ppo(policy, config).update(observations, actions, log_probs, advantages, rng, step_scale)
 
 
 def parameters_of(policy):
@@ -113,19 +113,18 @@ def test_every_epoch_sees_every_sample_once(network, batch, monkeypatch):
     assert not torch.equal(first, second)
 
 
-def test_step_size_anneals_with_what_remains(network, batch):
+def test_step_scale_multiplies_the_step_size(network, batch):
     """Adam's first step moves each parameter by about its step size, whatever the gradient."""
 
-    def moved(remaining, anneal):
+    def moved(step_scale):
         policy = network()
         before = parameters_of(policy)
-        config = PpoConfig(learning_rate=1e-2, epochs=1, minibatch_size=50, anneal=anneal)
-        improve(policy, config, *batch(policy, 50), remaining=remaining)
+        config = PpoConfig(learning_rate=1e-2, epochs=1, minibatch_size=50)
+        improve(policy, config, *batch(policy, 50), step_scale=step_scale)
         return float((parameters_of(policy) - before).abs().max())
 
-    assert moved(1.0, anneal=True) == pytest.approx(1e-2, rel=1e-2)
-    assert moved(0.25, anneal=True) == pytest.approx(0.25e-2, rel=1e-2)
-    assert moved(0.25, anneal=False) == pytest.approx(1e-2, rel=1e-2)
+    assert moved(1.0) == pytest.approx(1e-2, rel=1e-2)
+    assert moved(0.25) == pytest.approx(0.25e-2, rel=1e-2)
 
 
 def test_metrics(network, batch):
