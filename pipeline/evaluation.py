@@ -1,5 +1,6 @@
 """Evaluation on the true return, which nothing ever learns from. Letters: E episodes, T states, S observation."""
 
+import ctypes.util
 import os
 import sys
 from collections.abc import Mapping
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -81,10 +83,11 @@ def film(policy: GaussianPolicy, env_id: str, dynamics: Mapping[str, float], see
 
     Raises OSError when nothing can be rendered here, with what is missing.
     """
-    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
     import imageio.v3 as imageio
 
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        # Gymnasium tries GLFW first, which only fails once it has to draw.
+        os.environ.setdefault("MUJOCO_GL", "egl" if ctypes.util.find_library("EGL") else "osmesa")
     try:
         arguments: dict[str, Any] = {"render_mode": "rgb_array", **dynamics}
         env = gymnasium.make(env_id, **arguments)
@@ -99,7 +102,7 @@ def film(policy: GaussianPolicy, env_id: str, dynamics: Mapping[str, float], see
         fps = env.metadata["render_fps"] / FILM_EVERY
         env.close()
         imageio.imwrite(path, np.stack(frames), fps=fps)
-    except (ImportError, RuntimeError, AttributeError, gymnasium.error.Error) as error:
+    except (ImportError, RuntimeError, AttributeError, mujoco.FatalError, gymnasium.error.Error) as error:
         raise OSError(
             f"cannot render here ({error}); a machine without a display needs EGL or OSMesa "
             "(Debian: apt-get install libegl1 or libosmesa6, then MUJOCO_GL=egl or MUJOCO_GL=osmesa)"

@@ -1,0 +1,80 @@
+"""Two controls of the transferability itself, with real training.
+
+An expert in the imitator's own dynamics must come out as transferable. One that does nothing must not: GAIL's positive
+reward pays for staying alive, so an imitator of it learns to stand, and a score that only asked whether training "worked"
+would be fooled.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.artifacts import RunDirectory, encode_arrays, write_artifact
+from pipeline.config import parse_config
+from pipeline.data import Demonstrations
+from pipeline.datasets import encode_demonstrations
+from pipeline.environments import make_batch
+from pipeline.evaluation import run_episodes
+from pipeline.experts import load_expert
+from pipeline.policy import GaussianPolicy
+from pipeline.seeding import generator
+from pipeline.stage import Run
+from pipeline.stages.transferability import TransferabilityStage
+from tests.runs import ROOT
+from workers.engine import LocalEngine
+
+pytestmark = pytest.mark.timeout(1200)
+
+OWN = {"gravity": 9.8}
+COUNT = 10
+
+
+def idle(policy: GaussianPolicy) -> GaussianPolicy:
+    """Return a policy of the same shape that does nothing."""
+    return GaussianPolicy(
+        weights=tuple(np.zeros_like(weight) for weight in policy.weights),
+        biases=tuple(np.zeros_like(bias) for bias in policy.biases),
+        log_std=np.full_like(policy.log_std, -20),
+        input_mean=policy.input_mean,
+        input_scale=policy.input_scale,
+    )
+
+
+def test_own_dynamics_are_transferable_and_doing_nothing_is_not(tmp_path: Path) -> None:
+    expert, _ = load_expert(ROOT / "configs" / "experts" / "hopper-gravity-9.8")
+    simulators = make_batch("oodil/Hopper-v0", OWN, COUNT)
+    episodes = run_episodes(simulators, expert, generator((0,)), stochastic=False)
+    episodes += run_episodes(simulators, idle(expert), generator((1,)), stochastic=False)
+    demonstrations = Demonstrations(
+        observations=np.concatenate([episode.states for episode in episodes]),
+        offsets=np.cumsum([0, *(len(episode.states) for episode in episodes)]).astype(np.int64),
+        sources=np.repeat(np.arange(2, dtype=np.int32), COUNT),
+        source_labels=("own dynamics", "does nothing"),
+        returns=np.array([episode.env_return for episode in episodes]),
+    )
+    file = tmp_path / "demonstrations.safetensors"
+    file.write_bytes(encode_demonstrations(demonstrations, "oodil/Hopper-v0"))
+    values = {
+        "name": "controls",
+        "environment": {"id": "oodil/Hopper-v0", "dynamics": OWN},
+        "demonstrations": {"file": str(file)},
+        "transferability": {"gail": {"total_steps": 1_000_000}},
+        "imitation": {"gail": {"total_steps": 1}},
+    }
+    config = parse_config(values, "controls")
+    run = Run(config, RunDirectory(tmp_path / "run"))
+    run.directory.path.mkdir()
+    run.directory.config.write_text(config.model_dump_json())
+    write_artifact(run.directory.stage("demonstrations"), {}, {file.name: file.read_bytes()})
+    labels = encode_arrays({"labels": demonstrations.sources})
+    write_artifact(run.directory.stage("clustering"), {}, {"assignment.safetensors": labels})
+
+    stage = TransferabilityStage()
+    outcome = LocalEngine(2).run_jobs(stage, run, stage.jobs(run), lambda _: None, lambda: False)
+    assert not outcome.failed, outcome.failed
+    write_artifact(run.directory.stage(stage.name), {}, stage.combine(run))
+    scores = run.artifact(stage.name).arrays("transferability.safetensors")["scores"]
+    own, nothing = scores[:COUNT], scores[COUNT:]
+    assert own.min() > 0.1, scores
+    assert nothing.max() < own.min() / 2, scores
