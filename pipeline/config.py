@@ -268,8 +268,8 @@ class TransferabilityConfig(_Section):
     end, and the scores of what cannot be reproduced rise."""
     num_scores: int = Field(default=100, ge=2)
     """Times the demonstrations are scored while a job runs, evenly spaced."""
-    averaged_scores: PositiveInt = 20
-    """How many of the last scores are averaged."""
+    averaged_scores: PositiveInt = 5
+    """Window of the moving average of scores, of whose second half the most convinced decides."""
     sharpening: float = Field(default=2.0, gt=0.0)
     """Power to which a transferability is raised to become a weight; 1 is the paper's form (docs/decisions.md)."""
 

@@ -80,6 +80,10 @@ class Stage(ABC):
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return everything in the configuration that changes the result, as JSON values."""
 
+    def job_settings(self, config: RunConfig) -> dict[str, Any]:
+        """Return the part of the settings that its jobs depend on; all of it unless `combine` alone uses some."""
+        return self.settings(config)
+
     def jobs(self, run: Run) -> list[str]:
         """Return the names of its independent jobs; one named as the stage by default."""
         return [self.name]
@@ -105,7 +109,7 @@ class Stage(ABC):
     def job_origin(self, run: Run, job: str) -> dict[str, Any]:
         """Return what names a job's artifact and checkpoints."""
         origin = self.origin(run)
-        return origin if job == self.name else origin | {"job": job}
+        return origin if job == self.name else origin | {"job": job, "settings": self.job_settings(run.config)}
 
     def checkpoints(self, run: Run, job: str) -> Checkpoints:
         """Return the checkpoints of a job."""

@@ -26,6 +26,18 @@ def mean_logit_per_demonstration(discriminator: Discriminator, demonstrations: D
     return np.asarray(np.add.reduceat(logits, first) / counts)
 
 
+def most_convinced(logits: Array, window: int) -> Array:
+    """Return (N,) the highest moving average over ``window`` of the second half of a job's mean logits (E, N).
+
+    The discriminators of a GAIL job come and go; some are fooled for a while even by an imitator that fails. What can
+    be reproduced passes with every one of them once the imitator has learned it, so the most convinced one decides.
+    """
+    settled = logits[len(logits) // 2 :]
+    window = min(window, len(settled))
+    sums = np.cumsum(np.concatenate((np.zeros((1, settled.shape[1])), settled)), axis=0)
+    return np.asarray(((sums[window:] - sums[:-window]) / window).max(axis=0))
+
+
 def transferability(mean_logits: Array) -> Array:
     """Return sigmoid(-mean logit): 0.5 where the imitator cannot be told from the demonstration, 0 where it fails.
 

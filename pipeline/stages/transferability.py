@@ -1,6 +1,7 @@
 """Stage 3: one independent GAIL job per cluster; what its discriminators say of every demonstration (Eqn 5 and 6).
 
-The scores come from the last discriminators of each job. The true reward plays no part, not even in choosing them.
+The scores come from the discriminators of each job's second half. The true reward plays no part, not even in choosing
+among them.
 """
 
 from typing import Any
@@ -12,6 +13,7 @@ from pipeline.algorithms.gail import AdversarialReward
 from pipeline.algorithms.learner import Learner
 from pipeline.algorithms.transferability import (
     mean_logit_per_demonstration,
+    most_convinced,
     sampling_mass,
     sharpened_weights,
     transferability,
@@ -37,6 +39,15 @@ class TransferabilityStage(Stage):
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the section and the imitator's environment."""
         return config.transferability.model_dump(mode="json") | {"environment": config.environment.model_dump()}
+
+    def job_settings(self, config: RunConfig) -> dict[str, Any]:
+        """Return what the trainings depend on; reading their scores in another way does not train again."""
+        section = config.transferability
+        return {
+            "gail": section.gail.model_dump(mode="json"),
+            "num_scores": section.num_scores,
+            "environment": config.environment.model_dump(),
+        }
 
     def jobs(self, run: Run) -> list[str]:
         """Return one job per cluster that has demonstrations, named by the cluster's id."""
@@ -70,14 +81,14 @@ class TransferabilityStage(Stage):
         }
 
     def combine(self, run: Run) -> Files:
-        """Average each job's last scores, turn them into weights, and say how well the sources are told apart."""
+        """Read each job's scores, turn them into weights, and say how well the sources are told apart."""
         config = run.config
         demonstrations = load_demonstrations(run)
         logits = np.full(len(demonstrations), np.nan)
         history = {}
         for job in self.jobs(run):
             arrays = run.job_artifact(self.name, job).arrays(_JOB_FILE)
-            logits[arrays["demonstrations"]] = arrays["logits"][-config.transferability.averaged_scores :].mean(axis=0)
+            logits[arrays["demonstrations"]] = most_convinced(arrays["logits"], config.transferability.averaged_scores)
             cluster = job.replace("-", "_")
             history[f"{cluster}/env_steps"] = arrays["env_steps"]
             history[f"{cluster}/scores"] = transferability(arrays["logits"])

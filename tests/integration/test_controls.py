@@ -1,7 +1,7 @@
 """Two controls of the transferability itself, with real training.
 
-An expert in the imitator's own dynamics must come out as transferable. One that does nothing must not: GAIL's positive
-reward pays for staying alive, so an imitator of it learns to stand, and a score that only asked whether training "worked"
+An expert in the imitator's own dynamics must come out as transferable. One that does nothing must not: a positive
+reward pays for staying alive, so an imitator of it learns to stand, and a score that only asked if training "worked"
 would be fooled.
 """
 
