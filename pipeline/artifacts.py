@@ -211,7 +211,7 @@ class Checkpoints:
 
     def exist(self) -> bool:
         """Return whether there is anything to resume from."""
-        return bool(self._paths())
+        return self.load()[0] is not None
 
     def clear(self) -> None:
         """Delete all checkpoints: the job is finished."""

@@ -269,8 +269,8 @@ class TransferabilityConfig(_Section):
     num_scores: int = Field(default=100, ge=2)
     """Times the demonstrations are scored while a job runs, evenly spaced."""
     averaged_scores: PositiveInt = 5
-    """Window of the moving average of scores, of whose second half the most convinced decides."""
-    sharpening: float = Field(default=2.0, gt=0.0)
+    """Window of the moving average of scores, of whose last third the most convinced decides."""
+    sharpening: float = Field(default=3.0, gt=0.0)
     """Power to which a transferability is raised to become a weight; 1 is the paper's form (docs/decisions.md)."""
 
     @model_validator(mode="before")

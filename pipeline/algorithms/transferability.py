@@ -27,12 +27,12 @@ def mean_logit_per_demonstration(discriminator: Discriminator, demonstrations: D
 
 
 def most_convinced(logits: Array, window: int) -> Array:
-    """Return (N,) the highest moving average over ``window`` of the second half of a job's mean logits (E, N).
+    """Return (N,) the highest moving average over ``window`` of the last third of a job's mean logits (E, N).
 
     The discriminators of a GAIL job come and go; some are fooled for a while even by an imitator that fails. What can
     be reproduced passes with every one of them once the imitator has learned it, so the most convinced one decides.
     """
-    settled = logits[len(logits) // 2 :]
+    settled = logits[2 * len(logits) // 3 :]
     window = min(window, len(settled))
     sums = np.cumsum(np.concatenate((np.zeros((1, settled.shape[1])), settled)), axis=0)
     return np.asarray(((sums[window:] - sums[:-window]) / window).max(axis=0))

@@ -1,6 +1,6 @@
 """Stage 3: one independent GAIL job per cluster; what its discriminators say of every demonstration (Eqn 5 and 6).
 
-The scores come from the discriminators of each job's second half. The true reward plays no part, not even in choosing
+The scores come from the discriminators of the last third of each job. The true reward plays no part, not even in choosing
 among them.
 """
 

@@ -28,9 +28,9 @@ def test_mean_logit_is_over_the_transitions_of_each_demonstration(demonstrations
     np.testing.assert_allclose(mean_logit_per_demonstration(discriminator, made), expected, rtol=1e-5)
 
 
-def test_the_most_convinced_of_the_second_half_decides():
-    """Second half (1, 5, 3): averages over 2 are 3 and 4. The 9 of the first half does not count."""
-    logits = np.array([[9.0, 0.0], [9.0, 0.0], [0.0, 0.0], [1.0, -2.0], [5.0, -4.0], [3.0, -3.0]])
+def test_the_most_convinced_of_the_last_third_decides():
+    """Last third (1, 5, 3): averages over 2 are 3 and 4. The 9 before does not count."""
+    logits = np.concatenate((np.full((6, 2), 9.0), [[1.0, -2.0], [5.0, -4.0], [3.0, -3.0]]))
     np.testing.assert_allclose(most_convinced(logits, 2), [4.0, -3.0])
     np.testing.assert_allclose(most_convinced(logits, 1), [5.0, -2.0])
     np.testing.assert_allclose(most_convinced(logits, 99), [3.0, -3.0])
