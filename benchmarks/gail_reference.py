@@ -44,6 +44,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
     "official": {
         "normalise_observations": False,
+        "value": {"learning_rate": 3e-4, "epochs": 1},
         "anneal": False,
         "lag": 0,
     },

@@ -73,10 +73,10 @@ class ValueConfig(_Section):
 
     hidden: Hidden = (64, 64)
     """Widths of the hidden layers."""
-    learning_rate: PositiveFloat = 3e-4
-    """Adam's step size."""
-    epochs: PositiveInt = 1
-    """Passes over each batch."""
+    learning_rate: PositiveFloat = 1e-3
+    """Adam's step size; 3e-4 in the official code."""
+    epochs: PositiveInt = 3
+    """Passes over each batch; 1 in the official code."""
     minibatch_size: PositiveInt = 86
     """Transitions per gradient step; the official code cuts each batch into 30."""
 

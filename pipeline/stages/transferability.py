@@ -1,7 +1,7 @@
 """Stage 3: one independent GAIL job per cluster; what its discriminators say of every demonstration (Eqn 5 and 6).
 
-The scores come from the discriminators of the last third of each job. The true reward plays no part, not even in choosing
-among them.
+The scores come from the discriminators of the last third of each job. The true reward plays no part, not even in
+choosing among them.
 """
 
 from typing import Any
