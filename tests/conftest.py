@@ -8,6 +8,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 from collections.abc import Callable  # noqa: E402
 
+import hypothesis  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 import torch  # noqa: E402
@@ -19,6 +20,9 @@ from pipeline.policy import GaussianPolicy  # noqa: E402
 from pipeline.rollout import Rollout  # noqa: E402
 
 torch.set_num_threads(1)
+# A busy machine is no defect, and the gate must give the same answer twice.
+hypothesis.settings.register_profile("oodil", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("oodil")
 
 Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 

@@ -21,7 +21,7 @@ from pipeline.artifacts import (
     write_artifact,
 )
 
-SETTINGS = settings(max_examples=50, deadline=None)
+SETTINGS = settings(max_examples=50)
 
 names = st.text("abcdefghijklmnopqrstuvwxyz_0123456789", min_size=1, max_size=8).map(lambda name: name + ".bin")
 files = st.dictionaries(names, st.binary(max_size=40), min_size=1, max_size=4)

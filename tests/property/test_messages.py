@@ -128,13 +128,13 @@ def bits(value: Any) -> Any:
     return value
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(all_messages)
 def test_a_message_arrives_bit_for_bit(message: Message) -> None:
     assert bits(decode(encode(message))) == bits(message)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(all_messages, st.data())
 def test_a_message_cut_short_or_with_other_frames_is_refused(message: Message, data: st.DataObject) -> None:
     frames = encode(message)
@@ -151,7 +151,7 @@ def test_a_message_cut_short_or_with_other_frames_is_refused(message: Message, d
             decode([*frames[:index], frames[index][:-1], *frames[index + 1 :]])
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(all_messages, st.data())
 def test_a_flipped_byte_gives_a_message_or_an_error_and_nothing_else(message: Message, data: st.DataObject) -> None:
     frames = encode(message)
@@ -170,7 +170,7 @@ values = st.recursive(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.lists(st.binary(max_size=100), max_size=4), values)
 def test_arbitrary_bytes_are_refused(frames: list[bytes], value: Any) -> None:
     for attempt in (frames, [msgpack.packb(value)], [msgpack.packb(value), *frames]):
@@ -181,7 +181,7 @@ def test_arbitrary_bytes_are_refused(frames: list[bytes], value: Any) -> None:
             decode_report(content)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.integers(0, 4), values)
 def test_any_part_of_a_header_may_be_a_lie(part: int, value: Any) -> None:
     message = UnitFailure(Header("run", "learner.1", "worker.1", 3), 1, 2, "traceback")

@@ -8,7 +8,7 @@ from pipeline.algorithms.gail import AdversarialReward
 from pipeline.config import DiscriminatorConfig
 from pipeline.data import Demonstrations
 
-SETTINGS = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SETTINGS = settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 weighted_lengths = st.lists(
     st.tuples(st.integers(2, 12), st.one_of(st.just(0.0), st.floats(1e-6, 1e6))), min_size=1, max_size=8
