@@ -11,31 +11,32 @@ from pipeline.environments.mujoco import HopperEnv
 from tests.runs import MICRO, artifacts, run
 
 pytestmark = pytest.mark.timeout(600)
+NAIVE = "baselines=[naive_gail]"
 
 
 @pytest.fixture(scope="module")
 def inline(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run without any worker."""
     run_dir = tmp_path_factory.mktemp("inline") / "run"
-    run("run", str(MICRO), "--run-dir", str(run_dir), "--workers", "0")
+    run("run", str(MICRO), NAIVE, "--run-dir", str(run_dir), "--workers", "0")
     return run_dir
 
 
 @pytest.mark.parametrize("workers", [1, 2, 4])
 def test_the_number_of_workers_does_not_change_a_bit(inline: Path, tmp_path: Path, workers: int) -> None:
-    run("run", str(MICRO), "--run-dir", str(tmp_path / "run"), "--workers", str(workers))
+    run("run", str(MICRO), NAIVE, "--run-dir", str(tmp_path / "run"), "--workers", str(workers))
     assert artifacts(tmp_path / "run") == artifacts(inline)
 
 
 def test_a_finished_run_is_reused_and_a_changed_field_recomputes_what_follows(inline: Path) -> None:
     before = artifacts(inline)
-    output = run("run", str(MICRO), "--run-dir", str(inline), "--workers", "0")
+    output = run("run", str(MICRO), NAIVE, "--run-dir", str(inline), "--workers", "0")
     assert output.count("reused") == len(before)
-    output = run("run", str(MICRO), "transferability.sharpening=1", "--run-dir", str(inline), "--workers", "0")
+    output = run("run", str(MICRO), NAIVE, "transferability.sharpening=1", "--run-dir", str(inline), "--workers", "0")
     assert "transferability: recomputed: sharpening 3.0 -> 1.0" in output
     assert "imitation: recomputed: its input transferability changed" in output
     assert "clustering: reused" in output and "naive_gail: reused" in output
-    run("run", str(MICRO), "--run-dir", str(inline), "--workers", "0")
+    run("run", str(MICRO), NAIVE, "--run-dir", str(inline), "--workers", "0")
     assert artifacts(inline) == before
 
 
@@ -64,9 +65,9 @@ def test_a_reward_of_nan_trains_to_the_same_bits(inline: Path, tmp_path: Path, m
     from pipeline.stages import stages
     from workers.engine import LocalEngine
 
-    config = load_config(MICRO, ["environment.id=oodil/NanHopper-v0"])
+    config = load_config(MICRO, [NAIVE, "environment.id=oodil/NanHopper-v0"])
     poisoned = Run(config, RunDirectory(tmp_path / "run"))
-    sound = Run(load_config(MICRO), RunDirectory(inline))
+    sound = Run(load_config(MICRO, [NAIVE]), RunDirectory(inline))
     from pipeline.artifacts import write_artifact
 
     for stage in stages(config):
