@@ -88,8 +88,9 @@ class FakeStage(Stage):
                 assert (result.iteration, result.group) == (iteration, group)
                 total = total * 1.1 + result.rollout.observations[-1]
             iteration += 1
-            note(folder / f"{job}.iterations", str(iteration))
             self.checkpoints(run, job).save(iteration, {"iteration": np.array(iteration), "total": total})
+            # Noted once the checkpoint is safe, so that a test that waits for the note knows where a resume begins.
+            note(folder / f"{job}.iterations", str(iteration))
             context.progress(iteration, self.num_iterations, reward=float(total.mean()))
             if job == "raises" and iteration >= 2:
                 raise ArithmeticError(f"told to, in attempt {len(lines(folder / 'raises.attempts'))}")
