@@ -3,6 +3,7 @@
 Shapes are checked where a value is made, so that no stage has to ask again.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,11 @@ from numpy.typing import NDArray
 
 class DataError(ValueError):
     """Demonstrations that cannot be used; the message names the demonstration, the value and the limit."""
+
+
+def offsets_of(lengths: Iterable[int]) -> NDArray[np.int64]:
+    """Return (N + 1,) where each of N demonstrations of these lengths starts, and the end."""
+    return np.cumsum([0, *lengths], dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -83,7 +89,7 @@ class Demonstrations:
         parts = [self[int(n)] for n in chosen]
         return Demonstrations(
             observations=np.concatenate(parts),
-            offsets=np.cumsum([0, *(len(p) for p in parts)]).astype(np.int64),
+            offsets=offsets_of(len(p) for p in parts),
             sources=self.sources[chosen],
             source_labels=self.source_labels,
             returns=self.returns[chosen],

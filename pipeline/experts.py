@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.algorithms.learner import EnvReward, Learner
 from pipeline.artifacts import Artifact, Checkpoints, Files, encode_arrays, encode_json, read_artifact
 from pipeline.config import EnvironmentConfig, PpoConfig, TrainingConfig, ValueConfig
-from pipeline.data import DataError, Demonstrations
+from pipeline.data import DataError, Demonstrations, offsets_of
 from pipeline.environments import make_batch
 from pipeline.evaluation import Episode, run_episodes
 from pipeline.policy import GaussianPolicy
@@ -104,7 +104,7 @@ def collect_demonstrations(
     states = [episode.states for episode in kept[:count]]
     demonstrations = Demonstrations(
         observations=np.concatenate(states),
-        offsets=np.cumsum([0, *(len(s) for s in states)]).astype(np.int64),
+        offsets=offsets_of(len(s) for s in states),
         sources=np.zeros(count, np.int32),
         source_labels=(label,),
         returns=np.array([episode.env_return for episode in kept[:count]]),

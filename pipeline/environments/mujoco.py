@@ -40,6 +40,11 @@ class BatchedTask(Protocol):
         """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
 
 
+def _uniform_velocity(task: "HopperEnv | Walker2dEnv", rng: np.random.Generator) -> Floats:
+    scale = task._reset_noise_scale
+    return task.init_qvel + rng.uniform(low=-scale, high=scale, size=task.model.nv)
+
+
 class HopperEnv(hopper_v5.HopperEnv):
     """Hopper-v5 with root x in the observation and a chosen ``gravity`` in m/s^2 (positive, downwards)."""
 
@@ -66,8 +71,7 @@ class HopperEnv(hopper_v5.HopperEnv):
 
     def reset_velocity(self, rng: np.random.Generator) -> Floats:
         """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
-        scale = self._reset_noise_scale
-        return self.init_qvel + rng.uniform(low=-scale, high=scale, size=self.model.nv)
+        return _uniform_velocity(self, rng)
 
 
 class Walker2dEnv(walker2d_v5.Walker2dEnv):
@@ -97,8 +101,7 @@ class Walker2dEnv(walker2d_v5.Walker2dEnv):
 
     def reset_velocity(self, rng: np.random.Generator) -> Floats:
         """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
-        scale = self._reset_noise_scale
-        return self.init_qvel + rng.uniform(low=-scale, high=scale, size=self.model.nv)
+        return _uniform_velocity(self, rng)
 
 
 class HalfCheetahEnv(half_cheetah_v5.HalfCheetahEnv):

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.artifacts import Files, encode_json
 from pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
-from pipeline.data import DataError, Demonstrations
+from pipeline.data import DataError, Demonstrations, offsets_of
 from pipeline.datasets import decode_demonstrations, encode_demonstrations, read_demonstrations
 from pipeline.experts import collect_demonstrations, load_expert
 from pipeline.stage import JobContext, Run, Stage
@@ -79,7 +79,7 @@ class DemonstrationsStage(Stage):
             kept[described["label"]] = described["kept_share"]
         joined = Demonstrations(
             observations=np.concatenate([p.observations for p in parts]),
-            offsets=np.cumsum(np.concatenate([[0], *(p.lengths for p in parts)])).astype(np.int64),
+            offsets=offsets_of(length for p in parts for length in p.lengths),
             sources=np.repeat(np.arange(len(parts), dtype=np.int32), [len(p) for p in parts]),
             source_labels=tuple(source.label for source in sources),
             returns=np.concatenate([p.returns for p in parts]),
