@@ -160,9 +160,9 @@ class LearnerLoop(Stage):
         environment, gail = run.config.environment, run.config.imitation.gail
         demonstrations = random_demonstrations(environment.id)
         weights = np.linspace(0.1, 1.0, len(demonstrations))
-        reward = AdversarialReward(demonstrations, weights, gail.discriminator, 0)
-        action_dim = make_batch(environment.id, environment.dynamics, 1).action_dim
-        learner = Learner(demonstrations.observation_dim, action_dim, gail, reward, 0)
+        simulators = make_batch(environment.id, environment.dynamics, 1)
+        reward = AdversarialReward(demonstrations, weights, simulators.max_episode_steps, gail.discriminator, 0)
+        learner = Learner(simulators.observation_dim, simulators.action_dim, gail, reward, 0)
         train(learner, environment, gail, [], context, self.checkpoints(run, job))
         return {}
 
@@ -188,6 +188,7 @@ def random_demonstrations(env_id: str, count: int = 10, num_states: int = 1001) 
         sources=np.zeros(count, np.int32),
         source_labels=("random",),
         returns=np.full(count, np.nan),
+        terminated=np.zeros(count, np.bool_),
     )
 
 

@@ -33,6 +33,8 @@ class Demonstrations:
     """What each source is called."""
     returns: NDArray[np.float64]
     """(N,) true returns in the demonstrator's own environment, NaN where unknown; for reporting only."""
+    terminated: NDArray[np.bool_]
+    """(N,) whether it ended because the demonstrator failed, as opposed to a time limit or the end of a recording."""
 
     def __post_init__(self) -> None:
         if self.observations.ndim != 2 or self.observations.dtype != np.float32 or not self.observations.shape[1]:
@@ -54,10 +56,24 @@ class Demonstrations:
             n = int(np.searchsorted(self.offsets, row, side="right")) - 1
             value = self.observations[row][~np.isfinite(self.observations[row])][0]
             raise DataError(f"demonstration {n} has the value {value} in state {row - self.offsets[n]}; must be finite")
-        if self.sources.shape != (len(self),) or self.returns.shape != (len(self),):
-            raise DataError(f"sources and returns must have one entry for each of the {len(self)} demonstrations")
+        for name in ("sources", "returns", "terminated"):
+            if getattr(self, name).shape != (len(self),):
+                raise DataError(f"{name} must have one entry for each of the {len(self)} demonstrations")
         if self.sources.min() < 0 or self.sources.max() >= len(self.source_labels):
             raise DataError(f"source indices must lie in [0, {len(self.source_labels)})")
+
+    @classmethod
+    def joined(cls, parts: "list[Demonstrations]") -> "Demonstrations":
+        """Return the demonstrations of several sets, one after the other; each keeps its own sources."""
+        first_label = offsets_of(len(part.source_labels) for part in parts).astype(np.int32)
+        return cls(
+            observations=np.concatenate([part.observations for part in parts]),
+            offsets=offsets_of(length for part in parts for length in part.lengths),
+            sources=np.concatenate([part.sources + first for part, first in zip(parts, first_label, strict=False)]),
+            source_labels=tuple(label for part in parts for label in part.source_labels),
+            returns=np.concatenate([part.returns for part in parts]),
+            terminated=np.concatenate([part.terminated for part in parts]),
+        )
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -93,4 +109,5 @@ class Demonstrations:
             sources=self.sources[chosen],
             source_labels=self.source_labels,
             returns=self.returns[chosen],
+            terminated=self.terminated[chosen],
         )

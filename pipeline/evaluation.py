@@ -39,6 +39,8 @@ class Episode:
     """(T, S), the first and the last state included."""
     env_return: float
     """Sum of the environment's own reward."""
+    terminated: bool
+    """Whether it ended before the time limit."""
 
 
 def run_episodes(
@@ -49,7 +51,7 @@ def run_episodes(
     for g in range(count):
         simulators.reset(g, seed=int(rng.integers(2**31)))
     trace = [simulators.observations().astype(np.float32)]
-    returns, lengths = np.zeros(count), np.zeros(count, np.int64)
+    returns, lengths, terminated = np.zeros(count), np.zeros(count, np.int64), np.zeros(count, np.bool_)
     std = np.exp(policy.log_std)
     while not lengths.all():
         actions: NDArray[np.floating] = policy.mean(simulators.observations())
@@ -60,8 +62,9 @@ def run_episodes(
         ended = (outcome.terminated | outcome.truncated) & (lengths == 0)
         lengths[ended] = simulators.elapsed_steps()[ended]
         returns[ended] = simulators.episode_returns()[ended]
+        terminated[ended] = outcome.terminated[ended]
     states = np.stack(trace)
-    return [Episode(states[: lengths[g] + 1, g], float(returns[g])) for g in range(count)]
+    return [Episode(states[: lengths[g] + 1, g], float(returns[g]), bool(terminated[g])) for g in range(count)]
 
 
 def evaluate(

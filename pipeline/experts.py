@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.algorithms.learner import EnvReward, Learner
 from pipeline.artifacts import Artifact, Checkpoints, Files, encode_arrays, encode_json, read_artifact
 from pipeline.config import EnvironmentConfig, PpoConfig, TrainingConfig, ValueConfig
 from pipeline.data import DataError, Demonstrations, offsets_of
@@ -18,7 +17,6 @@ from pipeline.evaluation import Episode, run_episodes
 from pipeline.policy import GaussianPolicy
 from pipeline.seeding import derive_key, generator
 from pipeline.stage import JobContext
-from pipeline.training import train
 
 EXPERT_TRAINING = TrainingConfig(
     total_steps=2_500_000,
@@ -48,6 +46,9 @@ def train_expert(
     environment: EnvironmentConfig, config: TrainingConfig, seed: int, context: JobContext, checkpoints: Checkpoints
 ) -> GaussianPolicy:
     """Train one expert on the environment's reward."""
+    from pipeline.algorithms.learner import EnvReward, Learner
+    from pipeline.training import train
+
     simulators = make_batch(environment.id, environment.dynamics, 1)
     learner = Learner(simulators.observation_dim, simulators.action_dim, config, EnvReward(), seed)
     train(learner, environment, config, [], context, checkpoints)
@@ -101,12 +102,16 @@ def collect_demonstrations(
             )
         context.progress(min(len(kept), count), count)
     share = len(kept) / (rounds * COLLECTION_SIMULATORS)
-    states = [episode.states for episode in kept[:count]]
-    demonstrations = Demonstrations(
-        observations=np.concatenate(states),
-        offsets=offsets_of(len(s) for s in states),
-        sources=np.zeros(count, np.int32),
+    return demonstrations_of(kept[:count], label), share
+
+
+def demonstrations_of(episodes: list[Episode], label: str) -> Demonstrations:
+    """Return the states of the episodes of one source."""
+    return Demonstrations(
+        observations=np.concatenate([episode.states for episode in episodes]),
+        offsets=offsets_of(len(episode.states) for episode in episodes),
+        sources=np.zeros(len(episodes), np.int32),
         source_labels=(label,),
-        returns=np.array([episode.env_return for episode in kept[:count]]),
+        returns=np.array([episode.env_return for episode in episodes]),
+        terminated=np.array([episode.terminated for episode in episodes]),
     )
-    return demonstrations, share

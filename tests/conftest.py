@@ -80,6 +80,7 @@ def demonstrations() -> Callable[..., Demonstrations]:
             sources=np.zeros(len(lengths), np.int32),
             source_labels=("only",),
             returns=np.full(len(lengths), np.nan),
+            terminated=np.zeros(len(lengths), np.bool_),
         )
 
     return make

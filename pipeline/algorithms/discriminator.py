@@ -3,16 +3,19 @@
 One convention everywhere: logits are high for demonstrations, ``D = sigmoid(logit)`` is the probability that a pair
 comes from a demonstration, label 1 is the demonstration and 0 the policy. The paper writes the opposite class as 1.
 
-Letters: B batch, M demonstration pairs, S observation.
+Letters: N demonstrations, B batch, M demonstration pairs, S observation.
 """
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from pipeline.algorithms.networks import MLP
 from pipeline.algorithms.optimiser import Adam
 from pipeline.config import DiscriminatorConfig
+from pipeline.data import Demonstrations, offsets_of
 
 
 def discriminator_loss(demonstration_logits: Tensor, policy_logits: Tensor) -> Tensor:
@@ -29,17 +32,35 @@ def imitation_reward(logits_expert_is_high: Tensor) -> Tensor:
 
 
 class Discriminator(nn.Module):
-    """A network on pairs (s, s') and its optimiser."""
+    """A network on pairs (s, s') and its optimiser.
 
-    def __init__(self, observation_dim: int, config: DiscriminatorConfig, rng: torch.Generator) -> None:
+    With ``sees_ends`` a pair has one more entry, 0 for transitions and 1 for the state after a failure, whose other
+    entries are 0: an absorbing state (Kostrikov et al. 2019, https://arxiv.org/abs/1809.02925).
+    """
+
+    def __init__(
+        self, observation_dim: int, sees_ends: bool, config: DiscriminatorConfig, rng: torch.Generator
+    ) -> None:
         super().__init__()
         self.config = config
-        self.net = MLP(2 * observation_dim, config.hidden, 1, rng)
+        self.sees_ends = sees_ends
+        self.net = MLP(2 * observation_dim + sees_ends, config.hidden, 1, rng)
         self.optimiser = Adam(list(self.parameters()), config.learning_rate)
 
     def forward(self, pairs: Tensor) -> Tensor:
-        """Return (B,) logits of (B, 2S) pairs; high for demonstrations."""
+        """Return (B,) logits of `pairs`; high for demonstrations."""
         return self.net(pairs).squeeze(-1)
+
+    def pairs(self, states: NDArray[np.float32], successors: NDArray[np.float32]) -> Tensor:
+        """Return (B, 2S), or (B, 2S + 1) with ``sees_ends``, from (B, S) states and their successors."""
+        flag = [np.zeros((len(states), 1), np.float32)] if self.sees_ends else []
+        return torch.from_numpy(np.concatenate((states, successors, *flag), axis=1))
+
+    def absorbing_pair(self) -> Tensor:
+        """Return (2S + 1,): what follows a failure, for ever."""
+        pair = torch.zeros(self.net.layers[0].in_features)
+        pair[-1] = 1
+        return pair
 
     def update(self, demonstration_pairs: Tensor, policy_pairs: Tensor) -> dict[str, float]:
         """Take one full-batch step on (M, 2S) demonstration pairs against (B, 2S) policy pairs."""
@@ -53,3 +74,27 @@ class Discriminator(nn.Module):
                 "demonstration_accuracy": float((logits[:count] > 0).float().mean()),
                 "policy_accuracy": float((logits[count:] < 0).float().mean()),
             }
+
+
+@torch.no_grad()
+def mean_logit_per_demonstration(
+    discriminator: Discriminator, demonstrations: Demonstrations, horizon: int
+) -> NDArray[np.float64]:
+    """Return (N,) logits averaged over each demonstration, for Eqn (6).
+
+    One that ended in failure goes on in the absorbing state until the horizon, in steps.
+    """
+    starts = demonstrations.transition_starts()
+    states = demonstrations.observations
+    logits = discriminator(discriminator.pairs(states[starts], states[starts + 1])).double().numpy()
+    counts = demonstrations.lengths - 1
+    sums = np.add.reduceat(logits, offsets_of(counts)[:-1])
+    if discriminator.sees_ends:
+        after = absorbed_steps(demonstrations, horizon)
+        sums, counts = sums + after * float(discriminator(discriminator.absorbing_pair())), counts + after
+    return np.asarray(sums / counts)
+
+
+def absorbed_steps(demonstrations: Demonstrations, horizon: int) -> NDArray[np.int64]:
+    """Return (N,) steps between a failure and the horizon; 0 for demonstrations that did not fail."""
+    return np.where(demonstrations.terminated, np.maximum(0, horizon - (demonstrations.lengths - 1)), 0)

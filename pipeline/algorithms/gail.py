@@ -11,7 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.algorithms.discriminator import Discriminator, imitation_reward
+from pipeline.algorithms.discriminator import (
+    Discriminator,
+    absorbed_steps,
+    imitation_reward,
+    mean_logit_per_demonstration,
+)
 from pipeline.algorithms.learner import side_by_side
 from pipeline.config import DiscriminatorConfig
 from pipeline.data import Demonstrations
@@ -26,10 +31,14 @@ class AdversarialReward:
         self,
         demonstrations: Demonstrations,
         weights: NDArray[np.float64],
+        horizon: int,
         config: DiscriminatorConfig,
         root_seed: int,
     ) -> None:
         """Prepare to draw pairs in proportion to ``weights`` (N,), one per demonstration (Eqn 7).
+
+        Where some demonstrations ended in failure, the discriminator also compares how much of an episode of
+        ``horizon`` steps is left after one. It is not part of the reward: nobody is paid for falling.
 
         Raises ValueError unless the weights are finite, not negative and not all zero.
         """
@@ -39,11 +48,16 @@ class AdversarialReward:
             raise ValueError("all weights are zero: there is nothing to imitate")
         self.root_seed = root_seed
         self._starts = demonstrations.transition_starts()
-        self._cumulative = np.cumsum(np.repeat(weights, demonstrations.lengths - 1))
+        self._horizon = horizon
+        after_end = absorbed_steps(demonstrations, horizon)
+        mass = np.repeat(weights, demonstrations.lengths - 1)
+        if after_end.any():
+            mass = np.append(mass, weights @ after_end)
+        self._cumulative = np.cumsum(mass)
         self._state_weights = np.repeat(weights, demonstrations.lengths)
         self._observations = demonstrations.observations
         rng = torch.Generator().manual_seed(torch_seed(derive_key(root_seed, "discriminator", "initial")))
-        self.discriminator = Discriminator(demonstrations.observation_dim, config, rng)
+        self.discriminator = Discriminator(demonstrations.observation_dim, bool(after_end.any()), config, rng)
 
     def state_moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return mean and standard deviation (S,) of the demonstrations' states as they are weighted."""
@@ -55,15 +69,20 @@ class AdversarialReward:
     @torch.no_grad()
     def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:
         """Return (T, G) rewards of the discriminator before its own step of the same iteration."""
-        rewards = imitation_reward(self.discriminator(_policy_pairs(rollouts))).numpy()
+        rewards = imitation_reward(self.discriminator(self._policy_pairs(rollouts))).numpy()
         return rewards.reshape(rollouts[0].terminated.shape[0], -1)
 
     def update(self, rollouts: list[Rollout], iteration: int, step_scale: float) -> dict[str, float]:
         """Step the discriminator on the rollouts against as many demonstration pairs, or all of them if fewer."""
         config = self.discriminator.config
         self.discriminator.optimiser.learning_rate = config.learning_rate * step_scale
-        policy_pairs = _policy_pairs(rollouts)
+        policy_pairs = self._policy_pairs(rollouts)
         rng = generator(derive_key(self.root_seed, "discriminator", iteration))
+        if self.discriminator.sees_ends:
+            # An episode of the policy is followed by as many absorbed steps as it falls short of the horizon.
+            after_end = sum(int((self._horizon - r.episode_lengths).sum()) for r in rollouts)
+            absorbed = rng.random(len(policy_pairs)) * (len(policy_pairs) + after_end) < after_end
+            policy_pairs[torch.from_numpy(absorbed)] = self.discriminator.absorbing_pair()
         count = min(len(self._starts), len(policy_pairs))
         metrics: dict[str, float] = {}
         for _ in range(config.steps_per_iteration):
@@ -71,12 +90,18 @@ class AdversarialReward:
         return metrics
 
     def draw(self, count: int, rng: np.random.Generator) -> Tensor:
-        """Draw (count, 2S) demonstration pairs with replacement, in proportion to the weights."""
+        """Draw ``count`` demonstration pairs with replacement, in proportion to the weights."""
         points = rng.random(count) * self._cumulative[-1]
         chosen = np.searchsorted(self._cumulative, points, side="right")
         starts = self._starts[np.minimum(chosen, len(self._starts) - 1)]
-        pairs = np.concatenate((self._observations[starts], self._observations[starts + 1]), axis=1)
-        return torch.from_numpy(pairs)
+        pairs = self.discriminator.pairs(self._observations[starts], self._observations[starts + 1])
+        if self.discriminator.sees_ends:
+            pairs[torch.from_numpy(chosen >= len(self._starts))] = self.discriminator.absorbing_pair()
+        return pairs
+
+    def mean_logits(self, demonstrations: Demonstrations) -> NDArray[np.float64]:
+        """Return (N,) mean logits of demonstrations by the discriminator as it stands."""
+        return mean_logit_per_demonstration(self.discriminator, demonstrations, self._horizon)
 
     def state(self) -> dict[str, Tensor]:
         """Return the discriminator and its optimiser."""
@@ -89,9 +114,9 @@ class AdversarialReward:
         moments = {k[10:]: v for k, v in state.items() if k.startswith("optimiser/")}
         self.discriminator.optimiser.load_state(moments)
 
-
-def _policy_pairs(rollouts: list[Rollout]) -> Tensor:
-    """Return (B, 2S): each state with its successor, step by step, groups side by side."""
-    states = side_by_side([r.observations for r in rollouts])
-    successors = side_by_side([r.next_observations for r in rollouts])
-    return torch.from_numpy(np.concatenate((states, successors), axis=2)).flatten(0, 1)
+    def _policy_pairs(self, rollouts: list[Rollout]) -> Tensor:
+        """Return B pairs: each state with its successor, step by step, groups side by side."""
+        states = side_by_side([r.observations for r in rollouts])
+        successors = side_by_side([r.next_observations for r in rollouts])
+        dim = states.shape[-1]
+        return self.discriminator.pairs(states.reshape(-1, dim), successors.reshape(-1, dim))

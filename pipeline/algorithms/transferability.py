@@ -1,29 +1,14 @@
-"""From discriminators to transferability to weights: the paper's Eqn (6) and (7).
+"""From logits to transferability to weights: the paper's Eqn (6) and (7).
 
-Letters: N demonstrations, M transitions, E scores taken while a job ran, S observation.
+Letters: N demonstrations, E scores taken while a job ran.
 """
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from scipy.special import expit
 
-from pipeline.algorithms.discriminator import Discriminator
 from pipeline.data import Demonstrations
 
 Array = NDArray[np.float64]
-
-
-@torch.no_grad()
-def mean_logit_per_demonstration(discriminator: Discriminator, demonstrations: Demonstrations) -> Array:
-    """Return (N,) discriminator logits averaged over the transitions of each demonstration."""
-    starts = demonstrations.transition_starts()
-    states = demonstrations.observations
-    pairs = torch.from_numpy(np.concatenate((states[starts], states[starts + 1]), axis=1))
-    logits = discriminator(pairs).double().numpy()
-    counts = demonstrations.lengths - 1
-    first = np.concatenate(([0], np.cumsum(counts)[:-1]))
-    return np.asarray(np.add.reduceat(logits, first) / counts)
 
 
 def most_convinced(logits: Array, window: int) -> Array:
@@ -43,7 +28,7 @@ def transferability(mean_logits: Array) -> Array:
 
     ``mean_logits`` is (N,) or (E, N), of logits that are high for demonstrations; the paper's D is one minus ours.
     """
-    return np.asarray(expit(-mean_logits))
+    return np.exp(-np.logaddexp(0, mean_logits))
 
 
 def sharpened_weights(scores: Array, sharpening: float) -> Array:

@@ -11,7 +11,13 @@ from pipeline.data import DataError, Demonstrations
 
 SCHEMA = "1"
 _HEADER = "oodil"
-_DTYPES = {"observations": np.float32, "offsets": np.int64, "sources": np.int32, "returns": np.float64}
+_DTYPES = {
+    "observations": np.float32,
+    "offsets": np.int64,
+    "sources": np.int32,
+    "returns": np.float64,
+    "terminated": np.bool_,
+}
 
 
 def encode_demonstrations(demonstrations: Demonstrations, environment_id: str) -> bytes:
@@ -29,8 +35,8 @@ def encode_demonstrations(demonstrations: Demonstrations, environment_id: str) -
 def read_demonstrations(path: Path) -> tuple[Demonstrations, str]:
     """Return the demonstrations of a file and the id of the environment they are from.
 
-    ``observations`` and ``offsets`` are required; without ``sources`` all are from one source. Raises DataError that
-    names the file and what is wrong with it.
+    ``observations`` and ``offsets`` are required; without ``sources`` all are from one source, without ``terminated``
+    none ended in failure. Raises DataError that names the file and what is wrong with it.
     """
     try:
         content = path.read_bytes()
@@ -57,6 +63,7 @@ def decode_demonstrations(content: bytes, origin: str) -> tuple[Demonstrations, 
     count = max(len(arrays["offsets"]) - 1, 0)
     arrays.setdefault("sources", np.zeros(count, np.int32))
     arrays.setdefault("returns", np.full(count, np.nan))
+    arrays.setdefault("terminated", np.zeros(count, np.bool_))
     for name, dtype in _DTYPES.items():
         if arrays[name].dtype != dtype:
             raise DataError(f"{origin}: array {name!r} is {arrays[name].dtype}; expected {np.dtype(dtype)}")

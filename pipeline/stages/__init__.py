@@ -1,16 +1,19 @@
-"""The stages, in order; which of them a run has follows from its configuration."""
+"""The stages, in order; which of them a run has follows from its configuration.
+
+A stage loads what it computes with inside ``run_job``, so that reading a run, or starting one, does not wait for torch.
+"""
 
 from pipeline.config import RunConfig
 from pipeline.stage import Stage
+from pipeline.stages.clustering import ClusteringStage
+from pipeline.stages.demonstrations import DemonstrationsStage
+from pipeline.stages.experts import ExpertsStage
+from pipeline.stages.imitation import ImitationStage, NaiveGailStage, OracleStage
+from pipeline.stages.transferability import TransferabilityStage
 
 
 def stages(config: RunConfig) -> list[Stage]:
     """Return the stages of a run, each after those it reads from."""
-    from pipeline.stages.clustering import ClusteringStage
-    from pipeline.stages.demonstrations import DemonstrationsStage
-    from pipeline.stages.imitation import ImitationStage, NaiveGailStage, OracleStage
-    from pipeline.stages.transferability import TransferabilityStage
-
     baselines: dict[str, Stage] = {stage.name: stage for stage in (NaiveGailStage(), OracleStage())}
     method: list[Stage] = [DemonstrationsStage(), ClusteringStage(), TransferabilityStage(), ImitationStage()]
     return method + [baselines[name] for name in config.baselines]
@@ -18,8 +21,6 @@ def stages(config: RunConfig) -> list[Stage]:
 
 def stage_named(config: RunConfig, name: str) -> Stage:
     """Return a stage of the run by its name. Raises LookupError, naming those there are, if there is none."""
-    from pipeline.stages.experts import ExpertsStage
-
     for stage in (*stages(config), ExpertsStage()):
         if stage.name == name:
             return stage

@@ -4,20 +4,19 @@ Letters: N demonstrations, E embedding, K clusters.
 """
 
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from sklearn.metrics import calinski_harabasz_score, silhouette_score
-from threadpoolctl import threadpool_limits
 
-from pipeline.algorithms.clustering import ContrastiveClustering, Labelling
 from pipeline.artifacts import Files, encode_arrays, encode_json
 from pipeline.config import RunConfig
 from pipeline.data import Demonstrations
 from pipeline.stage import JobContext, JobStoppedError, Run, Stage
 from pipeline.stages.demonstrations import load_demonstrations
+
+if TYPE_CHECKING:
+    from pipeline.algorithms.clustering import ContrastiveClustering, Labelling
 
 
 class ClusteringStage(Stage):
@@ -39,6 +38,11 @@ class ClusteringStage(Stage):
             encoder.safetensors: the cluster model, see `ClusterModel.from_arrays`.
             diagnostics.json: see `diagnostics`.
         """
+        import torch
+        from threadpoolctl import threadpool_limits
+
+        from pipeline.algorithms.clustering import ContrastiveClustering
+
         torch.set_num_threads(1)
         # scikit-learn and NumPy have threads of their own, and sums depend on how many take part.
         with threadpool_limits(1):
@@ -55,7 +59,7 @@ class ClusteringStage(Stage):
             "diagnostics.json": encode_json(report),
         }
 
-    def _train(self, clustering: ContrastiveClustering, run: Run, job: str, context: JobContext) -> None:
+    def _train(self, clustering: "ContrastiveClustering", run: Run, job: str, context: JobContext) -> None:
         checkpoints = self.checkpoints(run, job)
         state, warnings = checkpoints.load()
         for warning in warnings:
@@ -74,12 +78,14 @@ class ClusteringStage(Stage):
                 raise JobStoppedError
 
 
-def diagnostics(labelling: Labelling, demonstrations: Demonstrations, num_clusters: int) -> dict[str, Any]:
+def diagnostics(labelling: "Labelling", demonstrations: Demonstrations, num_clusters: int) -> dict[str, Any]:
     """Return what the report says about an assignment; what needs source labels is for reporting only.
 
     silhouette (by cosine) and calinski_harabasz are None unless there are at least 2 clusters with members and one of
     them has more than one; contingency is {source label: demonstrations per cluster}.
     """
+    from sklearn.metrics import calinski_harabasz_score, silhouette_score
+
     sizes = np.bincount(labelling.labels, minlength=num_clusters)
     non_empty = int((sizes > 0).sum())
     scores: dict[str, float | None] = {"silhouette": None, "calinski_harabasz": None}

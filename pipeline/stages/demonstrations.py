@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.artifacts import Files, encode_json
 from pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
-from pipeline.data import DataError, Demonstrations, offsets_of
+from pipeline.data import DataError, Demonstrations
 from pipeline.datasets import decode_demonstrations, encode_demonstrations, read_demonstrations
 from pipeline.experts import collect_demonstrations, load_expert
 from pipeline.stage import JobContext, Run, Stage
@@ -77,14 +77,7 @@ class DemonstrationsStage(Stage):
             parts.append(decode_demonstrations(artifact.read(FILE), str(artifact.path / FILE))[0])
             described = artifact.json("source.json")
             kept[described["label"]] = described["kept_share"]
-        joined = Demonstrations(
-            observations=np.concatenate([p.observations for p in parts]),
-            offsets=offsets_of(length for p in parts for length in p.lengths),
-            sources=np.repeat(np.arange(len(parts), dtype=np.int32), [len(p) for p in parts]),
-            source_labels=tuple(source.label for source in sources),
-            returns=np.concatenate([p.returns for p in parts]),
-        )
-        return _files(joined, run.config, kept)
+        return _files(Demonstrations.joined(parts), run.config, kept)
 
 
 def load_demonstrations(run: Run) -> Demonstrations:

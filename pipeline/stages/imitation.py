@@ -5,8 +5,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.algorithms.gail import AdversarialReward
-from pipeline.algorithms.learner import Learner
 from pipeline.artifacts import Files, encode_arrays, encode_json
 from pipeline.config import RunConfig
 from pipeline.data import Demonstrations
@@ -15,7 +13,6 @@ from pipeline.evaluation import evaluate
 from pipeline.seeding import derive_key, torch_seed
 from pipeline.stage import JobContext, Run, Stage
 from pipeline.stages.demonstrations import load_demonstrations, transferable_mask
-from pipeline.training import Probe, train
 
 
 class ImitationStage(Stage):
@@ -36,13 +33,18 @@ class ImitationStage(Stage):
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Train the policy and evaluate it with its mean action."""
+        from pipeline.algorithms.gail import AdversarialReward
+        from pipeline.algorithms.learner import Learner
+        from pipeline.training import Probe, train
+
         config = run.config
         gail = config.imitation.gail
         environment = config.environment
         demonstrations = load_demonstrations(run)
         seed = torch_seed(derive_key(config.seed, "imitation"))
         simulators = make_batch(environment.id, environment.dynamics, 1)
-        reward = AdversarialReward(demonstrations, self.weights(run, demonstrations), gail.discriminator, seed)
+        weights, horizon = self.weights(run, demonstrations), simulators.max_episode_steps
+        reward = AdversarialReward(demonstrations, weights, horizon, gail.discriminator, seed)
         learner = Learner(simulators.observation_dim, simulators.action_dim, gail, reward, seed)
 
         def curve_point() -> NDArray[np.float64]:

@@ -7,12 +7,8 @@ choosing among them.
 from typing import Any
 
 import numpy as np
-from sklearn.metrics import roc_auc_score
 
-from pipeline.algorithms.gail import AdversarialReward
-from pipeline.algorithms.learner import Learner
 from pipeline.algorithms.transferability import (
-    mean_logit_per_demonstration,
     most_convinced,
     sampling_mass,
     sharpened_weights,
@@ -24,7 +20,6 @@ from pipeline.environments import make_batch
 from pipeline.seeding import derive_key, torch_seed
 from pipeline.stage import JobContext, Run, Stage
 from pipeline.stages.demonstrations import load_demonstrations, transferable_mask
-from pipeline.training import Probe, train
 
 _JOB_FILE = "scores.safetensors"
 
@@ -55,17 +50,20 @@ class TransferabilityStage(Stage):
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Imitate one cluster in the imitator's environment and score its demonstrations along the way."""
+        from pipeline.algorithms.gail import AdversarialReward
+        from pipeline.algorithms.learner import Learner
+        from pipeline.training import Probe, train
+
         config = run.config
         section = config.transferability
         members = np.flatnonzero(_labels(run) == int(job.removeprefix("cluster-")))
         demonstrations = load_demonstrations(run).select(members)
         seed = torch_seed(derive_key(config.seed, self.name, job))
         simulators = make_batch(config.environment.id, config.environment.dynamics, 1)
-        reward = AdversarialReward(demonstrations, np.ones(len(members)), section.gail.discriminator, seed)
+        weights, horizon = np.ones(len(members)), simulators.max_episode_steps
+        reward = AdversarialReward(demonstrations, weights, horizon, section.gail.discriminator, seed)
         learner = Learner(simulators.observation_dim, simulators.action_dim, section.gail, reward, seed)
-        probe = Probe(
-            "logits", section.num_scores, lambda: mean_logit_per_demonstration(reward.discriminator, demonstrations)
-        )
+        probe = Probe("logits", section.num_scores, lambda: reward.mean_logits(demonstrations))
         history = train(learner, config.environment, section.gail, [probe], context, self.checkpoints(run, job))
         discriminator = {name: value.numpy() for name, value in reward.discriminator.state_dict().items()}
         return {
@@ -106,6 +104,8 @@ class TransferabilityStage(Stage):
         }
         marked = transferable_mask(config, demonstrations)
         if marked is not None and 0 < marked.sum() < len(marked):
+            from sklearn.metrics import roc_auc_score
+
             shares = {
                 "transferable_share_before": np.ones(len(demonstrations)),
                 "transferable_share_unsharpened": scores,

@@ -108,7 +108,11 @@ def test_demonstration_files(config_for, tmp_path: Path, content: bytes, message
 def test_a_file_recorded_in_another_environment(config_for, tmp_path: Path) -> None:
     made = arrays()
     recorded = Demonstrations(
-        **made, sources=np.zeros(2, np.int32), source_labels=("other",), returns=np.full(2, np.nan)
+        **made,
+        sources=np.zeros(2, np.int32),
+        source_labels=("other",),
+        returns=np.full(2, np.nan),
+        terminated=np.zeros(2, np.bool_),
     )
     config, _ = config_for(encode_demonstrations(recorded, "oodil/Walker2d-v0"))
     assert "recorded in oodil/Walker2d-v0" in refused("run", str(config), "--run-dir", str(tmp_path / "run"))

@@ -26,9 +26,10 @@ def build(pairs):
         sources=np.zeros(len(lengths), np.int32),
         source_labels=("only",),
         returns=np.full(len(lengths), np.nan),
+        terminated=np.zeros(len(lengths), np.bool_),
     )
     weights = np.array([weight for _, weight in pairs])
-    return AdversarialReward(demonstrations, weights, DiscriminatorConfig(hidden=(2,)), 0), lengths, weights
+    return AdversarialReward(demonstrations, weights, 1000, DiscriminatorConfig(hidden=(2,)), 0), lengths, weights
 
 
 class Grid:

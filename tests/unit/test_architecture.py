@@ -177,8 +177,8 @@ def loaded_by(module: str) -> set[str]:
     return set(result.stdout.split())
 
 
-@pytest.mark.parametrize("module", ["pipeline.rollout", "workers.rollout"])
-def test_a_rollout_worker_starts_without_torch(module):
+@pytest.mark.parametrize("module", ["pipeline.rollout", "workers.rollout", "pipeline.stages", "walk"])
+def test_rollout_workers_and_the_orchestrator_start_without_torch(module):
     loaded = loaded_by(module)
     assert "mujoco" in loaded
     assert not loaded & {"torch", "sklearn", "matplotlib"}

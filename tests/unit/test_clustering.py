@@ -43,6 +43,7 @@ def three_dynamics(counts: tuple[int, int, int], seed: int = 0) -> Demonstration
         sources=np.repeat(np.arange(3, dtype=np.int32), counts),
         source_labels=("slow", "middle", "fast"),
         returns=np.full(sum(counts), np.nan),
+        terminated=np.zeros(sum(counts), np.bool_),
     )
 
 
@@ -162,10 +163,9 @@ def test_more_clusters_than_demonstrations_are_refused():
         ContrastiveClustering(three_dynamics((1, 1, 1)), ClusteringConfig(num_clusters=5), 0)
 
 
-def test_a_model_refuses_states_of_another_dimension_and_arrays_that_do_not_fit():
-    demonstrations = three_dynamics((2, 2, 2))
-    model = ContrastiveClustering(demonstrations, ClusteringConfig(**SMALL, num_clusters=2), 0).model()
-    wide = Demonstrations(np.zeros((9, 3), np.float32), np.array([0, 9]), np.zeros(1, np.int32), ("only",), np.zeros(1))
+def test_a_model_refuses_states_of_another_dimension_and_arrays_that_do_not_fit(demonstrations):
+    model = ContrastiveClustering(three_dynamics((2, 2, 2)), ClusteringConfig(**SMALL, num_clusters=2), 0).model()
+    wide = demonstrations(9)
     with pytest.raises(DataError, match="states have 3 dimensions"):
         model.label(wide, draws=1, root_seed=0)
     arrays = model.arrays()

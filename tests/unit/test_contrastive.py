@@ -22,6 +22,7 @@ def counting(lengths: list[int]) -> Demonstrations:
         sources=np.zeros(len(lengths), np.int32),
         source_labels=("only",),
         returns=np.zeros(len(lengths)),
+        terminated=np.zeros(len(lengths), np.bool_),
     )
 
 

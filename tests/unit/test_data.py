@@ -15,6 +15,7 @@ def make(lengths=(3, 2, 4), **changes):
         "sources": np.arange(len(lengths), dtype=np.int32) % 2,
         "source_labels": ("a", "b"),
         "returns": np.linspace(0, 1, len(lengths)),
+        "terminated": np.arange(len(lengths)) == 2,
     }
     return Demonstrations(**(parts | changes))
 
@@ -38,6 +39,7 @@ def test_select_keeps_order_and_labels():
     np.testing.assert_array_equal(chosen[1], make()[0])
     assert chosen.sources.tolist() == [0, 0]
     assert chosen.returns.tolist() == [1.0, 0.0]
+    assert chosen.terminated.tolist() == [True, False]
     assert chosen.transition_starts().tolist() == [0, 1, 2, 4, 5]
 
 
@@ -69,6 +71,7 @@ def with_value(value, row):
         ({"observations": with_value(np.inf, 0)}, "demonstration 0 has the value inf in state 0; must be finite"),
         ({"sources": np.zeros(2, np.int32)}, "each of the 3 demonstrations"),
         ({"returns": np.zeros(4)}, "each of the 3 demonstrations"),
+        ({"terminated": np.zeros(1, np.bool_)}, "terminated must have one entry for each of the 3 demonstrations"),
         ({"sources": np.array([0, 1, 2], np.int32)}, r"\[0, 2\)"),
         ({"sources": np.array([0, -1, 1], np.int32)}, r"\[0, 2\)"),
     ],

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.algorithms.discriminator import Discriminator
+from pipeline.algorithms.discriminator import Discriminator, mean_logit_per_demonstration
 from pipeline.algorithms.transferability import (
-    mean_logit_per_demonstration,
     most_convinced,
     sampling_mass,
     sharpened_weights,
@@ -17,7 +16,7 @@ from pipeline.config import DiscriminatorConfig
 
 def test_mean_logit_is_over_the_transitions_of_each_demonstration(demonstrations):
     made = demonstrations(4, 2, 3)
-    discriminator = Discriminator(3, DiscriminatorConfig(hidden=(8,)), torch.Generator().manual_seed(0))
+    discriminator = Discriminator(3, False, DiscriminatorConfig(hidden=(8,)), torch.Generator().manual_seed(0))
     with torch.no_grad():
         for p in discriminator.parameters():
             p.copy_(torch.randn(p.shape, generator=torch.Generator().manual_seed(1)))
@@ -25,7 +24,7 @@ def test_mean_logit_is_over_the_transitions_of_each_demonstration(demonstrations
         for n in range(3):
             states = torch.from_numpy(made[n])
             expected.append(float(discriminator(torch.cat((states[:-1], states[1:]), dim=1)).mean()))
-    np.testing.assert_allclose(mean_logit_per_demonstration(discriminator, made), expected, rtol=1e-5)
+    np.testing.assert_allclose(mean_logit_per_demonstration(discriminator, made, 9), expected, rtol=1e-5)
 
 
 def test_the_most_convinced_of_the_last_third_decides():
