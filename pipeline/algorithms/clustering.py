@@ -2,7 +2,10 @@
 
 The encoder is trained first by the contrastive loss alone, then together with K centres that follow their members as
 running means. Unlike the paper, the counters of these means start above zero, as in the official code, centres stay on
-the unit sphere, and the final label of a demonstration comes from the mean feature of several sub-trajectories.
+the unit sphere, and a demonstration stands for itself, at the start and at the end, by the mean feature of several
+sub-trajectories. The first phase is left out where the sub-trajectories of a demonstration agree on its cluster without
+it: it would only spread demonstrations evenly over the sphere and close the gap around a mode with few of them
+(docs/decisions.md).
 
 Letters: N demonstrations, B batch, l states of a sub-trajectory, S observation, E embedding, K clusters.
 """
@@ -93,17 +96,10 @@ class ClusterModel:
                 f"from states with {len(self.state_mean)}"
             )
         subtrajectories = Subtrajectories(demonstrations, self.sampling, self.state_mean, self.state_scale)
-        everyone = np.arange(len(demonstrations))
-        features = torch.stack(
-            [
-                _encode(self.encoder, subtrajectories, everyone, derive_key(root_seed, "clustering", "label", draw))
-                for draw in range(draws)
-            ]
-        )
+        features = _encode_all(self.encoder, subtrajectories, draws, derive_key(root_seed, "clustering", "label"))
         mean = normalize(features.mean(0), dim=-1)
-        labels = assign(mean, self.centres)
-        stability = float((assign(features, self.centres) == labels).double().mean())
-        return Labelling(labels.numpy().astype(np.int32), mean.numpy(), stability)
+        labels = assign(mean, self.centres).numpy().astype(np.int32)
+        return Labelling(labels, mean.numpy(), _stability(features, mean, self.centres))
 
     def arrays(self) -> dict[str, NDArray]:
         """Return everything by name, for a file; `from_arrays` is the inverse."""
@@ -157,8 +153,7 @@ class ContrastiveClustering:
         self._optimiser = Adam(list(self.encoder.parameters()), config.learning_rate, config.weight_decay)
         self.centres = torch.zeros(config.num_clusters, config.hidden)
         self.counts = torch.full((config.num_clusters,), config.initial_count)
-        if self._warmup == 0:
-            self._place_centres()
+        self._begin()
 
     def update(self) -> dict[str, float]:
         """Do one iteration and return metrics: loss, contrastive_loss."""
@@ -181,7 +176,7 @@ class ContrastiveClustering:
             self._move_centres(features, assign(features, self.centres))
         self.iteration += 1
         if self.iteration == self._warmup:
-            self._place_centres()
+            self.centres, _ = self._initial_centres()
         return {"loss": float(loss.detach()), "contrastive_loss": float(contrastive.detach())}
 
     def model(self) -> ClusterModel:
@@ -208,19 +203,29 @@ class ContrastiveClustering:
         self.centres, self.counts = tensors["centres"], tensors["counts"]
         self.iteration = int(tensors["iteration"])
 
+    def _begin(self) -> None:
+        """Place the centres and go straight to the joint phase where there is no warm-up, or no need for it."""
+        sufficient = self.config.sufficient_stability
+        if self._warmup == 0 or sufficient is not None:
+            centres, stability = self._initial_centres()
+            if sufficient is None or self._warmup == 0 or stability >= sufficient:
+                self.centres, self.iteration = centres, self._warmup
+
     @torch.no_grad()
-    def _place_centres(self) -> None:
-        """Initialise the centres: features of K random demonstrations, or the k-means of all of them."""
+    def _initial_centres(self) -> tuple[Tensor, float]:
+        """Return (K, E) features of K random demonstrations, or the k-means of all, and the stability of labels."""
+        config = self.config
         rng = generator(self._key("centres"))
-        count = len(self._subtrajectories)
-        if self.config.initial_centres == "trajectories":
-            chosen = rng.permutation(count)[: self.config.num_clusters]
-            centres = _encode(self.encoder, self._subtrajectories, chosen, self._key("centres", "views"))
+        features = _encode_all(self.encoder, self._subtrajectories, config.label_draws, self._key("centres", "views"))
+        mean = normalize(features.mean(0), dim=-1)
+        if config.initial_centres == "trajectories":
+            centres = features[0, rng.permutation(len(mean))[: config.num_clusters]]
         else:
-            features = _encode(self.encoder, self._subtrajectories, np.arange(count), self._key("centres", "views"))
-            kmeans = KMeans(self.config.num_clusters, n_init=10, random_state=int(rng.integers(2**31)))
-            centres = torch.from_numpy(kmeans.fit(features.numpy()).cluster_centers_)
-        self.centres = normalize(centres, dim=-1) if self.config.normalise_centres else centres
+            kmeans = KMeans(config.num_clusters, n_init=10, random_state=int(rng.integers(2**31)))
+            centres = torch.from_numpy(kmeans.fit(mean.numpy()).cluster_centers_)
+        if config.normalise_centres:
+            centres = normalize(centres, dim=-1)
+        return centres, _stability(features, mean, centres)
 
     def _move_centres(self, features: Tensor, labels: Tensor) -> None:
         centres, self.counts = moved_centres(self.centres, self.counts, features, labels)
@@ -228,6 +233,17 @@ class ContrastiveClustering:
 
     def _key(self, *path: str | int) -> Key:
         return derive_key(self.root_seed, "clustering", *path)
+
+
+def _stability(features: Tensor, mean: Tensor, centres: Tensor) -> float:
+    """Return the share of (draws, N, E) single features whose label is that of their (N, E) mean."""
+    return float((assign(features, centres) == assign(mean, centres)).double().mean())
+
+
+def _encode_all(encoder: Encoder, subtrajectories: Subtrajectories, draws: int, key: Key) -> Tensor:
+    """Return (draws, N, E) features of ``draws`` sub-trajectories of every demonstration."""
+    everyone = np.arange(len(subtrajectories))
+    return torch.stack([_encode(encoder, subtrajectories, everyone, (*key, draw)) for draw in range(draws)])
 
 
 def _encode(encoder: Encoder, subtrajectories: Subtrajectories, chosen: NDArray[np.int64], key: Key) -> Tensor:

@@ -1,4 +1,4 @@
-"""Phase 1: which demonstrations share a mode. One job; its artifact is the stage's.
+"""Stage 2: which demonstrations share a mode. One job; its artifact is the stage's.
 
 Letters: N demonstrations, E embedding, K clusters.
 """

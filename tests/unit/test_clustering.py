@@ -1,6 +1,7 @@
 """Assignment, centres and the whole of Algorithm 1; the stage gives the same bytes however often it is stopped."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,7 @@ def test_three_dynamics_are_told_apart_with_five_clusters():
     config = ClusteringConfig(
         subtrajectory_length=10,
         hidden=16,
+        learning_rate=0.01,
         warmup_iterations=100,
         joint_iterations=100,
         num_clusters=5,
@@ -289,3 +291,26 @@ def test_one_cluster_takes_everything_without_training(make_run):
     report = artifact.json("diagnostics.json")
     assert report["cluster_sizes"] == [20] and report["silhouette"] is None
     assert report["purity"] == pytest.approx(8 / 20)
+
+
+def leaning(counts: tuple[int, int, int], seed: int = 0) -> Demonstrations:
+    """Like `three_dynamics`, but each mode also has a level of its own, which shows without any training."""
+    made = three_dynamics(counts, seed)
+    level = np.array([-3.0, 0.0, 3.0], np.float32)[made.sources]
+    return replace(made, observations=made.observations + np.repeat(level, made.lengths)[:, None])
+
+
+@pytest.mark.parametrize(("make", "skipped"), [(leaning, True), (three_dynamics, False)])
+def test_the_warm_up_is_left_out_where_clusters_are_stable_without_it(make, skipped):
+    clustering = ContrastiveClustering(make((4, 50, 50)), ClusteringConfig(subtrajectory_length=10, num_clusters=3), 0)
+    assert clustering.iteration == (200 if skipped else 0)
+    assert bool(clustering.centres.any()) == skipped
+
+
+def test_a_mode_with_few_members_keeps_a_cluster_of_its_own():
+    demonstrations = leaning((4, 100, 100))
+    clustering = ContrastiveClustering(demonstrations, ClusteringConfig(subtrajectory_length=10, hidden=64), 0)
+    while clustering.iteration < 260:
+        clustering.update()
+    labels = clustering.model().label(demonstrations, draws=5, root_seed=0).labels
+    assert not set(labels[:4]) & set(labels[4:])

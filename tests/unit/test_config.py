@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 
 import pipeline.config
 from pipeline.config import (
-    OFFICIAL_CLUSTERING,
+    CLUSTERING_PRESETS,
     ClusteringConfig,
     ConfigError,
     ImitationConfig,
@@ -142,7 +142,7 @@ def test_bad_overrides_are_refused(write, override, message):
         ({"imitation": {"gail": {"total_steps": 9, "generator": {"kind": "sac"}}}}, "generator: .*sac.*'trpo', 'ppo'"),
         ({"environment": {"dynamics": {"gravity": "low"}}}, "environment.dynamics.gravity: .*number.*got 'low'"),
         ({"environment": {"dynamics": {"gravity": float("inf")}}}, "environment.dynamics.gravity: .*finite.*got inf"),
-        ({"clustering": {"preset": "offical"}}, "clustering: preset is 'offical'; the only one is 'official'"),
+        ({"clustering": {"preset": "offical"}}, "clustering: preset is 'offical'; there are paper, official"),
         ({"clustering": {"update_order": "both"}}, "clustering.update_order: .*step_first.*got 'both'"),
         ({"clustering": []}, "clustering: "),
         ({"demonstrations": {}}, "demonstrations: give either file or sources"),
@@ -188,13 +188,14 @@ def test_binary_and_missing_files_are_named(tmp_path):
         load_config(tmp_path / "binary.yaml")
 
 
-def test_the_official_preset_can_be_changed_in_parts():
-    official = ClusteringConfig.model_validate({"preset": "official"})
-    changed = ClusteringConfig.model_validate({"preset": "official", "label_draws": 3})
-    for key, value in OFFICIAL_CLUSTERING.items():
-        assert getattr(official, key) == value
-        assert getattr(official, key) != getattr(ClusteringConfig(), key), "the preset repeats the default"
-    assert changed == official.model_copy(update={"label_draws": 3})
+@pytest.mark.parametrize("name", CLUSTERING_PRESETS)
+def test_a_preset_can_be_changed_in_parts(name):
+    preset = ClusteringConfig.model_validate({"preset": name})
+    changed = ClusteringConfig.model_validate({"preset": name, "label_draws": 3})
+    for key, value in CLUSTERING_PRESETS[name].items():
+        assert getattr(preset, key) == value
+        assert getattr(preset, key) != getattr(ClusteringConfig(), key), "the preset repeats the default"
+    assert changed == preset.model_copy(update={"label_draws": 3})
 
 
 def test_a_configuration_cannot_be_changed():
