@@ -69,4 +69,4 @@ def test_an_expert_of_the_own_dynamics_is_transferable_and_doing_nothing_is_not(
     write_artifact(run.directory.stage(stage.name), {}, stage.combine(run))
     scores = run.artifact(stage.name).arrays("transferability.safetensors")["scores"]
     assert scores[:COUNT].min() > 0.1, scores
-    assert scores[COUNT:].max() < 0.05, scores
+    assert scores[COUNT:].max() < 0.5 * scores[:COUNT].min(), scores
