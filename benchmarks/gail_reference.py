@@ -2,7 +2,7 @@
 
 For every seed: environment steps and seconds until the deterministic policy first reaches a return of 2,900, and the
 return at the end of the budget. Run ``python benchmarks/gail_reference.py --json FILE``; ``--setting official`` takes
-the constants of the method's released code instead of the defaults.
+the constants of the method's released code instead of the defaults, ``ppo`` the other generator.
 """
 
 import argparse
@@ -45,10 +45,12 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
     "official": {
         "normalise_observations": False,
-        "value": {"learning_rate": 3e-4, "epochs": 1},
+        "generator": {"fisher_every": 1},
+        "value": {"learning_rate": 3e-4, "epochs": 1, "minibatch_size": 86},
         "anneal": False,
         "lag": 0,
     },
+    "ppo": {"generator": {"kind": "ppo"}},
 }
 
 

@@ -33,13 +33,15 @@ class EnvironmentConfig(_Section):
 
 
 class TrpoConfig(_Section):
-    """Trust region policy optimisation; the official constants."""
+    """Trust region policy optimisation; the official constants but for ``fisher_every``."""
 
     kind: Literal["trpo"] = "trpo"
     max_kl: PositiveFloat = 0.01
     """Size of the trust region, in nats per state."""
     damping: PositiveFloat = 0.1
     """Multiple of the identity added to the Fisher matrix."""
+    fisher_every: PositiveInt = 4
+    """Every n-th state of a batch enters the Fisher-vector products; 1 is the official code's."""
     cg_iterations: PositiveInt = 10
     """Conjugate gradient iterations per step."""
     cg_tolerance: PositiveFloat = 1e-10
@@ -77,7 +79,7 @@ class ValueConfig(_Section):
     """Adam's step size; 3e-4 in the official code."""
     epochs: PositiveInt = 3
     """Passes over each batch; 1 in the official code."""
-    minibatch_size: PositiveInt = 86
+    minibatch_size: PositiveInt = 256
     """Transitions per gradient step; the official code cuts each batch into 30."""
 
 
