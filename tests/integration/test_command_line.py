@@ -1,5 +1,6 @@
 """Bad input: one clear message and exit code 2, before any work starts."""
 
+import fcntl
 import json
 import shutil
 from pathlib import Path
@@ -132,6 +133,9 @@ def test_a_run_directory_of_another_run(tmp_path: Path) -> None:
     smoke = str(ROOT / "configs" / "smoke.yaml")
     assert 'holds a run with name "micro", not "smoke"' in refused("run", smoke, "--run-dir", str(run_dir))
     assert "no stage 'clustring'" in refused("resume", str(run_dir), "--until", "clustring")
+    with open(run_dir / ".lock") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert "another process is working on this run" in refused("resume", str(run_dir))
     described = json.loads(CliRunner().invoke(app, ["status", str(run_dir), "--json"]).output)
     assert described["stages"]["demonstrations"]["state"] == "done"
     assert described["stages"]["imitation"]["state"] == "pending"
