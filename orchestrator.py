@@ -51,7 +51,7 @@ def run(
 ) -> None:
     """Run the pipeline; what is already finished is reused, what was interrupted goes on."""
     with _bad_input():
-        from pipeline.config import load_config
+        from pipeline.loading import load_config
 
         config = load_config(config_path, overrides)
         from walk import check_inputs, open_run
@@ -152,7 +152,7 @@ def collect_demos(
     workers: Workers = None,
 ) -> None:
     """Collect demonstrations from the experts of a configuration into one file; interrupted, it goes on."""
-    from pipeline.config import load_config
+    from pipeline.loading import load_config
     from pipeline.stages import stages
     from pipeline.stages.experts import ExpertsStage
     from walk import check_inputs, open_run
@@ -192,7 +192,7 @@ def _execute(opened: "Run", workers: int | None, until: str | None, force: str |
 
 
 def _walk(opened: "Run", chosen: list["Stage"], workers: int | None, force: str | None) -> None:
-    from pipeline.config import ConfigError
+    from pipeline.loading import ConfigError
     from walk import UnfinishedError, walk
 
     try:

@@ -21,8 +21,9 @@ from pipeline.artifacts import (
     write_artifact,
     write_file,
 )
-from pipeline.config import ConfigError, RunConfig, parse_config
+from pipeline.config import RunConfig
 from pipeline.environments import make_batch
+from pipeline.loading import ConfigError, parse_config
 from pipeline.results import Results, summary
 from pipeline.stage import Run, Stage, is_current
 from pipeline.stages import stages

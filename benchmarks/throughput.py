@@ -35,10 +35,11 @@ from numpy.typing import NDArray
 from pipeline.algorithms.gail import AdversarialReward
 from pipeline.algorithms.learner import Learner
 from pipeline.artifacts import Files, RunDirectory
-from pipeline.config import PpoConfig, RunConfig, parse_config
+from pipeline.config import PpoConfig, RunConfig
 from pipeline.data import Demonstrations
 from pipeline.environments import Snapshot, make_batch
 from pipeline.environments.batch import STATE
+from pipeline.loading import parse_config
 from pipeline.stage import JobContext, Run, Stage
 from pipeline.training import train
 from pipeline.versions import library_versions

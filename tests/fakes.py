@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.artifacts import Files, RunDirectory, encode_arrays
-from pipeline.config import RunConfig, parse_config
+from pipeline.config import RunConfig
+from pipeline.loading import parse_config
 from pipeline.policy import GaussianPolicy
 from pipeline.rollout import Unit
 from pipeline.seeding import derive_key

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts import RunDirectory, encode_arrays, write_artifact
-from pipeline.config import parse_config
 from pipeline.data import Demonstrations
 from pipeline.datasets import encode_demonstrations
 from pipeline.environments import make_batch
 from pipeline.evaluation import run_episodes
 from pipeline.experts import demonstrations_of, load_expert
+from pipeline.loading import parse_config
 from pipeline.policy import GaussianPolicy
 from pipeline.seeding import generator
 from pipeline.stage import Run

@@ -5,9 +5,9 @@ from pathlib import Path
 import gymnasium
 import pytest
 
-from pipeline.config import load_config
 from pipeline.environments import MAX_EPISODE_STEPS
 from pipeline.environments.mujoco import HopperEnv
+from pipeline.loading import load_config
 from tests.runs import MICRO, artifacts, run
 
 pytestmark = pytest.mark.timeout(600)

@@ -13,15 +13,13 @@ import pipeline.config
 from pipeline.config import (
     CLUSTERING_PRESETS,
     ClusteringConfig,
-    ConfigError,
     ImitationConfig,
     PpoConfig,
     TrainingConfig,
     TransferabilityConfig,
     TrpoConfig,
-    load_config,
-    parse_config,
 )
+from pipeline.loading import ConfigError, load_config, parse_config
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = sorted((ROOT / "configs").glob("*.yaml"))

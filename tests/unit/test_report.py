@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.artifacts import Artifact, RunDirectory, encode_arrays, encode_json, write_artifact
-from pipeline.config import parse_config
+from pipeline.loading import parse_config
 from pipeline.report import write_report
 from pipeline.report.collection import Collection, Source
 from pipeline.report.figures import source_looks
