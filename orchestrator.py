@@ -15,6 +15,7 @@ import typer
 
 if TYPE_CHECKING:
     from pipeline.stage import Run, Stage
+    from workers.channels import Access
 
 # Before NumPy and torch are loaded: one compute thread per process, so that the bits do not depend on the machine.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -31,6 +32,8 @@ app = typer.Typer(
 )
 demos_app = typer.Typer(help="Inspect and collect demonstrations.", no_args_is_help=True)
 app.add_typer(demos_app, name="demos")
+keys_app = typer.Typer(help="Keys for rollout workers on other machines.", no_args_is_help=True)
+app.add_typer(keys_app, name="keys")
 
 ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="A YAML file; configs/ has examples.")]
 Overrides = Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Fields to override.")]
@@ -38,6 +41,8 @@ RunPath = Annotated[Path, typer.Argument(metavar="RUN_DIR", help="The folder of 
 Workers = Annotated[int | None, typer.Option("--workers", "-w", min=0, help="Parallel processes; 0 runs inline.")]
 Until = Annotated[str | None, typer.Option(help="Stop after this stage.")]
 Force = Annotated[str | None, typer.Option(help="Compute this stage again although it is finished.")]
+Bind = Annotated[str | None, typer.Option(help="Let workers of other machines join here, e.g. tcp://0.0.0.0:5555.")]
+Keys = Annotated[Path | None, typer.Option(help="Folder of keys, made by `oodil keys new`; --bind needs it.")]
 
 
 @app.command()
@@ -48,9 +53,12 @@ def run(
     run_dir: Annotated[Path | None, typer.Option(help="Default: runs/NAME-seedSEED.")] = None,
     until: Until = None,
     force: Force = None,
+    bind: Bind = None,
+    keys: Keys = None,
 ) -> None:
     """Run the pipeline; what is already finished is reused, what was interrupted goes on."""
     with _bad_input():
+        access = _access(bind, keys, workers)
         from pipeline.loading import load_config
 
         config = load_config(config_path, overrides)
@@ -58,18 +66,66 @@ def run(
 
         check_inputs(config)
         opened = open_run(run_dir or Path("runs") / f"{config.name}-seed{config.seed}", config)
-    _execute(opened, workers, until, force)
+    _execute(opened, workers, until, force, access)
 
 
 @app.command()
-def resume(run_dir: RunPath, workers: Workers = None, until: Until = None, force: Force = None) -> None:
+def resume(
+    run_dir: RunPath,
+    workers: Workers = None,
+    until: Until = None,
+    force: Force = None,
+    bind: Bind = None,
+    keys: Keys = None,
+) -> None:
     """Go on with an interrupted run, with any number of workers."""
     from walk import check_inputs, read_run
 
     with _bad_input():
+        access = _access(bind, keys, workers)
         opened = read_run(run_dir)
         check_inputs(opened.config)
-    _execute(opened, workers, until, force)
+    _execute(opened, workers, until, force, access)
+
+
+@app.command()
+def worker(
+    connect: Annotated[str, typer.Option(help="Address of a run started with --bind, e.g. tcp://lab-server:5555.")],
+    keys: Annotated[Path, typer.Option(help="This machine's folder of keys, made beside the run by `oodil keys new`.")],
+    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 1,
+    logs: Annotated[Path, typer.Option(help="Folder for their logs.")] = Path("worker-logs"),
+) -> None:
+    """Collect rollouts for a run on another machine, until Ctrl-C; come and go as you like."""
+    from terminal import stop_flag
+    from workers.keys import client_keys
+    from workers.remote import WorkersError, serve
+
+    with _bad_input():
+        client_keys(keys)
+    with stop_flag(lambda: print("stopping")) as should_stop:
+        try:
+            serve(connect, keys, workers, logs, print, should_stop)
+        except WorkersError as error:
+            print(f"oodil: {error}", file=sys.stderr)
+            raise typer.Exit(EXIT_FAILED) from None
+
+
+@keys_app.command("new")
+def new_keys(
+    folder: Annotated[Path, typer.Argument(metavar="KEYS", help="The folder of the learner's keys.")],
+    worker: Annotated[str | None, typer.Option(help="Allow one more machine, and make its keys.")] = None,
+) -> None:
+    """Make the learner's keys, or with --worker those of a machine that may join."""
+    from workers.channels import new_key_pair
+    from workers.keys import create_learner_keys, create_worker_keys
+
+    with _bad_input():
+        if worker is None:
+            create_learner_keys(folder, new_key_pair)
+            print(f"{folder}: the learner's keys; allow a machine with: oodil keys new {folder} --worker NAME")
+        else:
+            own = create_worker_keys(folder, worker, new_key_pair)
+            print(f"{own}: copy this folder to the machine, by a way that nobody else can read, and remove it here")
 
 
 @app.command()
@@ -171,7 +227,24 @@ def collect_demos(
     inspect_demos(output)
 
 
-def _execute(opened: "Run", workers: int | None, until: str | None, force: str | None) -> None:
+def _access(bind: str | None, keys: Path | None, workers: int | None) -> "Access | None":
+    """Return where other machines may join; refuse to listen without keys, or where it cannot be done."""
+    if bind is None and keys is None:
+        return None
+    if bind is None or keys is None:
+        raise ValueError("--bind and --keys belong together: nobody joins a run without a key (`oodil keys new`)")
+    if workers == 0:
+        raise ValueError("--bind needs a learner process; --workers 0 runs everything in one")
+    from workers.channels import Access, check_access
+
+    access = Access(bind, keys)
+    check_access(access)
+    return access
+
+
+def _execute(
+    opened: "Run", workers: int | None, until: str | None, force: str | None, access: "Access | None" = None
+) -> None:
     """Walk the stages, then write the report and print the summary."""
     from pipeline.report import write_report
     from pipeline.results import summary
@@ -185,18 +258,20 @@ def _execute(opened: "Run", workers: int | None, until: str | None, force: str |
             if name is not None and name not in names:
                 raise ValueError(f"no stage {name!r}; this run has {', '.join(names)}")
     try:
-        _walk(opened, chosen[: names.index(until or names[-1]) + 1], workers, force)
+        _walk(opened, chosen[: names.index(until or names[-1]) + 1], workers, force, access)
     finally:
         path = write_report(opened)
     print_summary(summary(opened), path)
 
 
-def _walk(opened: "Run", chosen: list["Stage"], workers: int | None, force: str | None) -> None:
+def _walk(
+    opened: "Run", chosen: list["Stage"], workers: int | None, force: str | None, access: "Access | None" = None
+) -> None:
     from pipeline.loading import ConfigError
     from walk import UnfinishedError, walk
 
     try:
-        walk(opened, chosen, workers, force)
+        walk(opened, chosen, workers, force, access)
     except ConfigError as error:
         print(f"oodil: {error}", file=sys.stderr)
         raise typer.Exit(EXIT_BAD_INPUT) from None

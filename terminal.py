@@ -1,6 +1,9 @@
 """How a run looks in a terminal: live progress, plain lines elsewhere, tables at the end."""
 
+import signal
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -19,6 +22,25 @@ PLAIN_INTERVAL_S = 10.0
 """Seconds between lines about one job where there is no terminal."""
 SHOWN_METRICS = ("return", "length", "loss", "value_loss")
 """Figures of a job that are shown beside its bar."""
+
+
+@contextmanager
+def stop_flag(announce: Callable[[], None]) -> Iterator[Callable[[], bool]]:
+    """Turn the first Ctrl-C or SIGTERM into a polite stop; a second one ends the run at once."""
+    received: list[int] = []
+
+    def handle(number: int, _frame: Any) -> None:
+        received.append(number)
+        if len(received) > 1:
+            raise KeyboardInterrupt
+        announce()
+
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(received)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 class Display:
@@ -58,6 +80,10 @@ class Display:
     def say(self, message: str) -> None:
         """Print one line above the live part."""
         self._console.print(message, highlight=False, soft_wrap=True)
+
+    def stopping(self) -> None:
+        """Say that a stop was heard."""
+        self.say("stopping after a checkpoint; press Ctrl-C again to stop at once")
 
     def reused(self, stage: str) -> None:
         """Say that a finished stage is taken as it is."""

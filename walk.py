@@ -5,7 +5,6 @@ Stages say what is computed, an engine says where; here it is only decided what 
 
 import fcntl
 import json
-import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -29,7 +28,8 @@ from pipeline.stage import Run, Stage, is_current
 from pipeline.stages import stages
 from pipeline.stages.demonstrations import check_demonstrations
 from pipeline.versions import library_versions
-from terminal import Display
+from terminal import Display, stop_flag
+from workers.channels import Access
 from workers.engine import Engine, LocalEngine, Outcome
 
 
@@ -79,11 +79,13 @@ def check_inputs(config: RunConfig) -> None:
     check_demonstrations(config, simulators.observation_dim)
 
 
-def walk(run: Run, chosen: list[Stage], workers: int | None, force: str | None = None) -> None:
+def walk(
+    run: Run, chosen: list[Stage], workers: int | None, force: str | None = None, access: Access | None = None
+) -> None:
     """Bring every chosen stage to its finished artifact. Raises UnfinishedError where that ends early."""
     workers = run.config.runtime.workers if workers is None else workers
-    engine = LocalEngine(workers)
-    with _lock(run.directory), Display() as display, _stop_flag(display) as should_stop:
+    engine = LocalEngine(workers, access=access)
+    with _lock(run.directory), Display() as display, stop_flag(display.stopping) as should_stop:
         _record(run.directory, "run_started", workers=workers, versions=library_versions())
         for stage in chosen:
             _bring_up(stage, run, engine, workers, force == stage.name, display, should_stop)
@@ -190,25 +192,6 @@ def describe(run: Run) -> dict[str, Any]:
         "stages": described,
         "results": summary(run),
     }
-
-
-@contextmanager
-def _stop_flag(display: Display) -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C or SIGTERM into a polite stop; a second one ends the run at once."""
-    received: list[int] = []
-
-    def handle(number: int, _frame: Any) -> None:
-        received.append(number)
-        if len(received) > 1:
-            raise KeyboardInterrupt
-        display.say("stopping after a checkpoint; press Ctrl-C again to stop at once")
-
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(received)
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 @contextmanager

@@ -4,6 +4,7 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 
 _LIBRARIES = ("torch", "mujoco", "gymnasium", "numpy")
+_COLLECTING = ("mujoco", "gymnasium", "numpy")
 
 
 def library_versions() -> dict[str, str]:
@@ -15,3 +16,9 @@ def library_versions() -> dict[str, str]:
         except PackageNotFoundError:
             versions[name] = "not installed"
     return versions
+
+
+def collecting_versions() -> str:
+    """Return what the bits of a rollout depend on; a learner takes none from a worker that has others."""
+    versions = library_versions()
+    return ", ".join(f"{name} {versions[name]}" for name in _COLLECTING)

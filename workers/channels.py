@@ -1,8 +1,10 @@
 """The sockets between the learner and its rollout workers; the only file that knows ZeroMQ.
 
 The learner binds a ROUTER and every worker connects a DEALER, so workers come and go as they like and the learner
-answers each by its name. Both ends are on this machine: the socket lies in a folder that only this user may enter.
-Every wait has a deadline, queues are bounded, and closing drops what was not sent, so nothing here can hang.
+answers each by its name. By default both ends are on this machine: the socket lies in a folder that only this user may
+enter. For workers on other machines the same socket also listens on an address, and then every peer, local ones
+included, must prove with CURVE that it holds a key that is allowed (`workers.keys`). Every wait has a deadline, queues
+are bounded, and closing drops what was not sent, so nothing here can hang.
 """
 
 import hashlib
@@ -12,10 +14,13 @@ import stat
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import zmq
+from zmq.auth.thread import ThreadAuthenticator
 
+from workers.keys import KeyPair, client_keys, server_keys
 from workers.messages import MAX_FRAME_BYTES
 
 _QUEUE_LIMIT = 64
@@ -24,10 +29,30 @@ _MAX_PATH = 100
 """Operating systems allow 104 (macOS) to 108 (Linux) bytes for the path of a socket."""
 _BATCH = 64
 """Messages that the learner takes in before it looks at anything else."""
+_HEARTBEAT_MS, _HEARTBEAT_TIMEOUT_MS = 2_000, 10_000
+"""How soon a connection that was cut without a word is given up; a worker connects again by itself."""
+
+
+_DOMAIN = "oodil"
+"""Of ZeroMQ's authentication protocol; nothing else shares our context."""
+
+
+@dataclass(frozen=True)
+class Access:
+    """How workers on other machines reach a learner."""
+
+    address: str
+    """Such as ``tcp://0.0.0.0:5555``."""
+    keys: Path
+    """The folder of the learner's keys and of the allowed ones."""
 
 
 class EndpointError(RuntimeError):
     """The folder for the socket cannot be used."""
+
+
+class AddressError(ValueError):
+    """Nothing can listen on an address; the message says why."""
 
 
 def endpoint_folder(run_path: Path) -> Path:
@@ -72,6 +97,8 @@ class _Socket:
         self._socket.setsockopt(zmq.SNDHWM, _QUEUE_LIMIT)
         self._socket.setsockopt(zmq.RCVHWM, _QUEUE_LIMIT)
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
+        self._socket.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
+        self._socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, _HEARTBEAT_TIMEOUT_MS)
 
     def close(self) -> None:
         """Close at once, dropping what was not sent."""
@@ -81,10 +108,22 @@ class _Socket:
 class Router(_Socket):
     """The learner's end. One thread uses it; only `wake` may be called from others."""
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint: str, access: Access | None = None) -> None:
+        """Bind the endpoint, and the address of ``access`` too; then only peers with an allowed key get in."""
         super().__init__(zmq.ROUTER)
         # Without it, what is sent to a worker that is gone disappears without a word.
         self._socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        # A worker that connects again before its old connection is given up takes its name over.
+        self._socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        self._authenticator: ThreadAuthenticator | None = None
+        if access is not None:
+            keys = server_keys(access.keys)
+            # Before the first bind: until somebody answers for the domain, nobody is let in.
+            self._authenticator = _authenticator(self._context, keys.allowed)
+            self._socket.curve_secretkey, self._socket.curve_publickey = keys.own.secret, keys.own.public
+            self._socket.curve_server = True
+            self._socket.zap_domain = _DOMAIN.encode()
+            self._socket.bind(access.address)
         self._socket.bind(endpoint)
         self._wake_reader, self._wake_writer = os.pipe()
         os.set_blocking(self._wake_reader, False)
@@ -124,6 +163,8 @@ class Router(_Socket):
 
     def close(self) -> None:
         """Close at once, dropping what was not sent."""
+        if self._authenticator is not None:
+            self._authenticator.stop()
         super().close()
         os.close(self._wake_reader)
         os.close(self._wake_writer)
@@ -132,8 +173,12 @@ class Router(_Socket):
 class Dealer(_Socket):
     """A rollout worker's end; it connects again by itself when a learner is replaced."""
 
-    def __init__(self, endpoint: str, name: str) -> None:
+    def __init__(self, endpoint: str, name: str, keys_folder: Path | None = None) -> None:
         super().__init__(zmq.DEALER)
+        if keys_folder is not None:
+            keys = client_keys(keys_folder)
+            self._socket.curve_secretkey, self._socket.curve_publickey = keys.own.secret, keys.own.public
+            self._socket.curve_serverkey = keys.server
         self._socket.setsockopt(zmq.IDENTITY, name.encode())
         self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
@@ -150,3 +195,34 @@ class Dealer(_Socket):
         except zmq.Again:
             return False
         return True
+
+
+def new_key_pair() -> KeyPair:
+    """Return a fresh CURVE key pair."""
+    public, secret = zmq.curve_keypair()
+    return KeyPair(public, secret)
+
+
+def check_access(access: Access) -> None:
+    """Raise AddressError or KeysError if nothing can listen there now, or with these keys."""
+    server_keys(access.keys)
+    context = zmq.Context()
+    try:
+        context.socket(zmq.ROUTER).bind(access.address)
+    except zmq.ZMQError as error:
+        raise AddressError(f"cannot listen on {access.address}: {error.strerror}") from error
+    finally:
+        context.destroy(linger=0)
+
+
+def _authenticator(context: zmq.Context, allowed: frozenset[bytes]) -> ThreadAuthenticator:
+    """Start the thread that ZeroMQ asks about every peer; only listed keys are let in."""
+
+    class AllowList:
+        def callback(self, domain: str, key: bytes) -> bool:
+            return key in allowed
+
+    authenticator = ThreadAuthenticator(context)
+    authenticator.start()
+    authenticator.configure_curve_callback(_DOMAIN, AllowList())
+    return authenticator

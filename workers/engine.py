@@ -18,7 +18,7 @@ from pipeline.rollout import InlineRollouts
 from pipeline.stage import JobStoppedError, RolloutSource, Run, Stage
 from workers import job as job_process
 from workers import rollout as rollout_process
-from workers.channels import private_endpoint
+from workers.channels import Access, private_endpoint
 from workers.messages import Progress, Silent, Warn
 from workers.supervisor import Died, Ended, Restarts, Said, Started, Supervisor
 from workers.supervisor import Event as ChildEvent
@@ -112,13 +112,16 @@ class Engine(Protocol):
 class LocalEngine:
     """Runs jobs on this machine: in ``workers`` processes, or with 0 in this one.
 
-    A distributed stage has one learner process, and ``workers`` rollout workers beside it.
+    A distributed stage has one learner process, and ``workers`` rollout workers beside it; with ``access`` others may
+    join them from elsewhere (`workers.remote`).
     """
 
-    def __init__(self, workers: int, stages: str = "pipeline.stages:stage_named") -> None:
+    def __init__(self, workers: int, stages: str = "pipeline.stages:stage_named", access: Access | None = None) -> None:
         if workers < 0:
             raise ValueError(f"workers is {workers}; it cannot be negative")
         self._workers = workers
+        self._access = access
+        """Where rollout workers of other machines may join, if they may."""
         self._stages = stages
         """Where a job's process finds ``(config, name) -> Stage``, as module:function."""
 
@@ -138,6 +141,9 @@ class LocalEngine:
             if stage.distributed:
                 parallel = 1
                 shared = {"endpoint": endpoint, "run_id": uuid.uuid4().hex}
+                if self._access is not None:
+                    shared["keys"] = str(self._access.keys)
+                    arguments["address"] = self._access.address
                 arguments |= shared
                 restarts = Restarts(run.config.runtime.max_worker_restarts, run.config.runtime.restart_delay_s)
                 for index in range(self._workers):

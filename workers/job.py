@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from workers.channels import Access
 from workers.messages import Progress, Silent, Warn, shortened
 from workers.supervisor import Link
 
@@ -44,8 +45,21 @@ class _Context:
         return self._link.should_stop()
 
 
-def main(link: Link, run_path: str, stages: str, stage: str, job: str, endpoint: str = "", run_id: str = "") -> str:
-    """Run one job; rollout workers collect for it if there is an endpoint. Returns DONE or STOPPED."""
+def main(
+    link: Link,
+    run_path: str,
+    stages: str,
+    stage: str,
+    job: str,
+    endpoint: str = "",
+    run_id: str = "",
+    address: str = "",
+    keys: str = "",
+) -> str:
+    """Run one job; rollout workers collect for it if there is an endpoint, those of other machines at the address.
+
+    Returns DONE or STOPPED.
+    """
     from pipeline.artifacts import RunDirectory
     from pipeline.config import RunConfig
     from pipeline.stage import JobStoppedError, Run
@@ -54,7 +68,8 @@ def main(link: Link, run_path: str, stages: str, stage: str, job: str, endpoint:
     config = RunConfig.model_validate_json(directory.config.read_text())
     module, _, function = stages.partition(":")
     found: Stage = getattr(importlib.import_module(module), function)(config, stage)
-    with _rollouts(link, endpoint, run_id, config.runtime.unit_timeout_s) as rollouts:
+    access = Access(address, Path(keys)) if address else None
+    with _rollouts(link, endpoint, run_id, config.runtime.unit_timeout_s, access) as rollouts:
         context = _Context(link, rollouts, config.runtime.checkpoint_interval_s)
         try:
             execute(found, Run(config, directory), job, context)
@@ -74,7 +89,9 @@ def execute(stage: "Stage", run: "Run", job: str, context: "JobContext") -> None
 
 
 @contextmanager
-def _rollouts(link: Link, endpoint: str, run_id: str, unit_timeout_s: float) -> "Iterator[RolloutSource]":
+def _rollouts(
+    link: Link, endpoint: str, run_id: str, unit_timeout_s: float, access: Access | None
+) -> "Iterator[RolloutSource]":
     from pipeline.rollout import InlineRollouts
     from workers.learner import ZmqRollouts
 
@@ -89,6 +106,7 @@ def _rollouts(link: Link, endpoint: str, run_id: str, unit_timeout_s: float) -> 
         unit_timeout_s=unit_timeout_s,
         should_stop=link.should_stop,
         report_silent=lambda worker: link.send(Silent(worker)),
+        access=access,
     )
     try:
         yield rollouts

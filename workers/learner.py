@@ -15,8 +15,19 @@ from dataclasses import dataclass, field
 
 from pipeline.rollout import Unit, UnitResult
 from pipeline.stage import JobStoppedError
-from workers.channels import Router
-from workers.messages import Header, MessageError, Ready, ResultMessage, UnitFailure, UnitMessage, decode, encode
+from pipeline.versions import collecting_versions
+from workers.channels import Access, Router
+from workers.messages import (
+    Header,
+    MessageError,
+    Ready,
+    Refused,
+    ResultMessage,
+    UnitFailure,
+    UnitMessage,
+    decode,
+    encode,
+)
 
 UNITS_PER_WORKER = 2
 """One in work and one waiting, so that a worker never waits for the learner's answer."""
@@ -189,6 +200,7 @@ class ZmqRollouts:
         unit_timeout_s: float,
         should_stop: Callable[[], bool] = lambda: False,
         report_silent: Callable[[str], None] = lambda worker: None,
+        access: Access | None = None,
     ) -> None:
         self._run_id = run_id
         self._incarnation = incarnation
@@ -200,7 +212,8 @@ class ZmqRollouts:
         self._error: Exception | None = None
         self._is_closing = False
         self._sequence = itertools.count()
-        self._channel = Router(endpoint)
+        self._versions = collecting_versions()
+        self._channel = Router(endpoint, access)
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
@@ -279,12 +292,12 @@ class ZmqRollouts:
             logging.warning("message of %s dropped: %s", worker, error)
             dropped["bad"] += 1
             return
-        if isinstance(message, UnitMessage) or message.header.sender != worker:
+        if isinstance(message, UnitMessage | Refused) or message.header.sender != worker:
             dropped["bad"] += 1
+        elif isinstance(message, Ready) and message.header.run_id in ("", self._run_id):
+            self._take_on(worker, message.versions)
         elif message.header.run_id != self._run_id:
             dropped["foreign"] += 1
-        elif isinstance(message, Ready):
-            self._dispatcher.ready(worker)
         elif message.header.incarnation != self._incarnation:
             dropped["stale"] += 1
         elif isinstance(message, ResultMessage):
@@ -292,3 +305,13 @@ class ZmqRollouts:
             self._last_result = now
         elif isinstance(message, UnitFailure):
             self._dispatcher.failed(worker, (message.iteration, message.group), message.traceback, now)
+
+    def _take_on(self, worker: str, versions: str) -> None:
+        """Let a worker in, unless its libraries could give other bits than ours."""
+        if versions == self._versions:
+            self._dispatcher.ready(worker)
+            return
+        self._dispatcher.dropped["versions"] += 1
+        reason = f"this worker has {versions}; the learner has {self._versions}"
+        logging.warning("%s refused: %s", worker, reason)
+        self._channel.send(worker, encode(Refused(Header(self._run_id, "", "learner", next(self._sequence)), reason)))

@@ -21,7 +21,7 @@ from pipeline.environments import Snapshot
 from pipeline.policy import GaussianPolicy
 from pipeline.rollout import Rollout, Unit, UnitResult
 
-SCHEMA = 1
+SCHEMA = 2
 """Raise it when the meaning of a message changes; other versions are refused."""
 MAX_FRAMES = 64
 MAX_HEADER_BYTES = 64 * 1024
@@ -52,9 +52,20 @@ class Header:
 # rollout worker -> learner, every second while idle: the heartbeat, and how a new learner finds its workers
 @dataclass(frozen=True)
 class Ready:
-    """A rollout worker has nothing to do."""
+    """A rollout worker has nothing to do. One that would work for any run leaves the header's run_id empty."""
 
     header: Header
+    versions: str
+    """What its rollouts are made with."""
+
+
+# learner -> rollout worker, in answer to Ready
+@dataclass(frozen=True)
+class Refused:
+    """The learner takes nothing from this worker; it should end."""
+
+    header: Header
+    reason: str
 
 
 # learner -> rollout worker
@@ -86,7 +97,7 @@ class UnitFailure:
     traceback: str
 
 
-Message = Ready | UnitMessage | ResultMessage | UnitFailure
+Message = Ready | Refused | UnitMessage | ResultMessage | UnitFailure
 
 
 # parent -> child
@@ -201,7 +212,8 @@ _UNIT: Readers = {
     "key": _key,
 }
 _FIELDS: dict[str, Readers] = {
-    "Ready": {},
+    "Ready": {"versions": _text},
+    "Refused": {"reason": _text},
     "UnitMessage": _UNIT,
     "ResultMessage": {"iteration": _count, "group": _count, "policy_version": _count},
     "UnitFailure": {"iteration": _count, "group": _count, "traceback": _text},
@@ -226,6 +238,7 @@ _SNAPSHOT = {
 }
 _ARRAYS: dict[str, dict[str, tuple[str, str]]] = {
     "Ready": {},
+    "Refused": {},
     "UnitMessage": {
         "policy.weight": ("<f4", "**"),
         "policy.bias": ("<f4", "*"),
@@ -314,7 +327,8 @@ def _put_together(kind: str, header: Header, values: dict[str, Any], arrays: Arr
         if kind == "ResultMessage":
             rollout = Rollout(policy_version=values.pop("policy_version"), **_below("rollout.", arrays))
             return ResultMessage(header, UnitResult(**values, rollout=rollout, snapshot=_snapshot(arrays)))
-        return UnitFailure(header, **values) if kind == "UnitFailure" else Ready(header)
+        others: dict[str, Callable[..., Message]] = {"Ready": Ready, "Refused": Refused, "UnitFailure": UnitFailure}
+        return others[kind](header, **values)
     except (TypeError, ValueError) as error:
         raise MessageError(f"incomplete {kind}: {error}") from error
 

@@ -4,13 +4,16 @@ import itertools
 import logging
 import time
 import traceback
+from pathlib import Path
 
 from pipeline.rollout import collect
+from pipeline.versions import collecting_versions
 from workers.channels import Dealer
 from workers.messages import (
     Header,
     MessageError,
     Ready,
+    Refused,
     ResultMessage,
     UnitFailure,
     UnitMessage,
@@ -24,22 +27,31 @@ READY_INTERVAL_S = 1.0
 _POLL_S = 0.1
 
 
-def main(link: Link, endpoint: str, run_id: str) -> str:
-    """Collect units for whichever learner is behind the endpoint, until asked to stop."""
-    channel = Dealer(endpoint, link.identity)
+class RefusedError(RuntimeError):
+    """The learner does not want this worker; the message says why."""
+
+
+def main(link: Link, endpoint: str, run_id: str = "", host: str = "", keys: str = "") -> str:
+    """Collect units for whichever learner is behind the endpoint, until asked to stop.
+
+    On another machine, ``host`` makes the worker's name unlike all others, and it works for any run.
+    """
+    name = host + link.identity
+    channel = Dealer(endpoint, name, Path(keys) if keys else None)
     try:
-        _serve(channel, link, run_id)
+        _serve(channel, link, name, run_id)
     finally:
         channel.close()
     return "stopped"
 
 
-def _serve(channel: Dealer, link: Link, run_id: str) -> None:
+def _serve(channel: Dealer, link: Link, name: str, run_id: str) -> None:
     sequence = itertools.count()
+    versions = collecting_versions()
     next_ready = time.monotonic()
     while not link.should_stop():
         if time.monotonic() >= next_ready:
-            channel.send(encode(Ready(Header(run_id, "", link.identity, next(sequence)))))
+            channel.send(encode(Ready(Header(run_id, "", name, next(sequence)), versions)))
             next_ready = time.monotonic() + READY_INTERVAL_S
         frames = channel.receive(_POLL_S)
         if frames is None:
@@ -49,10 +61,13 @@ def _serve(channel: Dealer, link: Link, run_id: str) -> None:
         except MessageError as error:
             logging.warning("message dropped: %s", error)
             continue
-        if not isinstance(message, UnitMessage) or message.header.run_id != run_id:
+        if isinstance(message, Refused):
+            raise RefusedError(message.reason)
+        if not isinstance(message, UnitMessage) or run_id not in ("", message.header.run_id):
             logging.warning("message dropped: no unit of run %s", run_id)
             continue
-        channel.send(_answer(message, Header(run_id, message.header.incarnation, link.identity, next(sequence))))
+        asked = message.header
+        channel.send(_answer(message, Header(asked.run_id, asked.incarnation, name, next(sequence))))
         next_ready = time.monotonic() + READY_INTERVAL_S
 
 

@@ -13,11 +13,12 @@ import pytest
 import pipeline.rollout
 from pipeline.rollout import InlineRollouts, Unit, UnitResult, collect
 from pipeline.stage import JobStoppedError, RolloutSource
+from pipeline.versions import collecting_versions
 from tests.fakes import hopper_units, wait_until
 from workers import learner, rollout
 from workers.channels import Dealer, private_endpoint
 from workers.learner import CollectError, Dispatcher, ZmqRollouts
-from workers.messages import Header, Ready, ResultMessage, UnitFailure, UnitMessage, decode, encode
+from workers.messages import Header, Message, Ready, Refused, ResultMessage, UnitFailure, UnitMessage, decode, encode
 from workers.supervisor import Died, Restarts, Started, Supervisor
 from workers.supervisor import Event as ChildEvent
 
@@ -63,15 +64,19 @@ class Puppet:
         """Return the header of an honest answer, but for some changes."""
         return replace(Header(RUN, "learner.1", self.name, 0), **changes)  # type: ignore[arg-type]
 
-    def ready(self) -> None:
+    def ready(self, versions: str = "") -> None:
         """Say that there is nothing to do."""
-        self._dealer.send(encode(Ready(self.header(incarnation=""))))
+        self._dealer.send(encode(Ready(self.header(incarnation=""), versions or collecting_versions())))
+
+    def next_message(self) -> Message:
+        """Return what the learner sends next."""
+        frames = self._dealer.receive(30.0)
+        assert frames is not None
+        return decode(frames)
 
     def next_unit(self) -> Unit:
         """Return the next unit that the learner sends."""
-        frames = self._dealer.receive(30.0)
-        assert frames is not None
-        message = decode(frames)
+        message = self.next_message()
         assert isinstance(message, UnitMessage)
         return message.unit
 
@@ -354,3 +359,14 @@ def test_a_failed_unit_returns_to_the_same_worker_only_if_there_is_no_other() ->
     assert names(units.assign(0.2)) == [("b", 0)]
     with pytest.raises(CollectError, match=r"(?s)failed 3 times, last in b.*third"):
         units.failed("b", (0, 0), "third", 0.3)
+
+
+def test_a_worker_with_other_libraries_is_refused_with_the_reason(endpoint: str, source: ZmqRollouts) -> None:
+    source.submit(hopper_units(0))
+    other = Puppet(endpoint, "other")
+    other.ready(versions="mujoco 3.0.0")
+    answer = other.next_message()
+    assert isinstance(answer, Refused)
+    assert "mujoco 3.0.0" in answer.reason and collecting_versions() in answer.reason
+    assert source.dropped["versions"] == 1
+    other.close()

@@ -25,6 +25,7 @@ from workers.messages import (
     MessageError,
     Progress,
     Ready,
+    Refused,
     Report,
     ResultMessage,
     Silent,
@@ -112,7 +113,13 @@ def result_messages(draw: st.DrawFn) -> ResultMessage:
 
 
 failures = st.builds(UnitFailure, headers, counts, counts, plain_texts)
-all_messages = st.one_of(st.builds(Ready, headers), unit_messages(), result_messages(), failures)
+all_messages = st.one_of(
+    st.builds(Ready, headers, plain_texts),
+    st.builds(Refused, headers, plain_texts),
+    unit_messages(),
+    result_messages(),
+    failures,
+)
 
 
 def bits(value: Any) -> Any:
@@ -276,7 +283,7 @@ def test_what_msgpack_might_fall_for_is_refused(content: bytes) -> None:
 
 
 def test_a_message_of_another_schema_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    frames = encode(Ready(Header("run", "", "worker.1", 0)))
+    frames = encode(Ready(Header("run", "", "worker.1", 0), "numpy 2"))
     monkeypatch.setattr(messages, "SCHEMA", messages.SCHEMA + 1)
     with pytest.raises(MessageError, match="schema"):
         decode(frames)
