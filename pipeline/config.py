@@ -309,6 +309,8 @@ class RuntimeConfig(_Section):
     """Seconds between checkpoints of a job; 0 checkpoints every iteration."""
     unit_timeout_s: PositiveFloat = 30.0
     """Seconds after which a unit of work is given to another rollout worker."""
+    job_timeout_s: PositiveFloat = 600.0
+    """Seconds without any progress after which a job counts as hung, is killed and started again."""
     max_attempts: PositiveInt = 3
     """Starts of a job before it counts as failed."""
     max_worker_restarts: PositiveInt = 20

@@ -1,6 +1,7 @@
 """A stage that is cheap and says in files what happened to it, and a configuration for it."""
 
 import os
+import signal
 import time
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,8 @@ class FakeStage(Stage):
     """Each iteration it collects and adds up; a job's name says what else happens to it.
 
     ``raises`` raises in every attempt from its second iteration on, ``killed`` kills its own process once, in the
-    middle, and ``waits`` does not end before the file ``go`` is in the run directory.
+    middle, ``frozen`` stops its own process once, and ``waits`` does not end before the file ``go`` is in the run
+    directory.
     """
 
     version = 1
@@ -95,8 +97,9 @@ class FakeStage(Stage):
             context.progress(iteration, self.num_iterations, reward=float(total.mean()))
             if job == "raises" and iteration >= 2:
                 raise ArithmeticError(f"told to, in attempt {len(lines(folder / 'raises.attempts'))}")
-            if job == "killed" and iteration == 3 and len(lines(folder / "killed.attempts")) == 1:
-                os.kill(os.getpid(), 9)
+            first = len(lines(folder / f"{job}.attempts")) == 1
+            if job in ("killed", "frozen") and iteration == 3 and first:
+                os.kill(os.getpid(), signal.SIGKILL if job == "killed" else signal.SIGSTOP)
             while job == "waits" and iteration == 2 and not (folder / "go").exists() and not context.should_stop():
                 time.sleep(0.01)
             if context.should_stop():

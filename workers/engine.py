@@ -174,6 +174,9 @@ class _Processes:
         self._done: set[str] = set()
         self._failed: dict[str, str] = {}
         self._first_reason: dict[str, str] = {}
+        self._attempts: dict[str, int] = {}
+        self._last_sign: dict[str, float] = {}
+        """When each running job last began or reported progress."""
         self._stopped = False
 
     def run(self, should_stop: Callable[[], bool]) -> Outcome:
@@ -187,6 +190,7 @@ class _Processes:
                 self._start(self._waiting.popleft())
             for event in self._supervisor.poll(_POLL_S):
                 self._handle(event)
+            self._kill_hung_jobs()
         done = [job for job in self._jobs if job in self._done]
         not_run = [job for job in self._jobs if job not in self._done and job not in self._failed]
         return Outcome(done, self._failed, not_run, self._stopped)
@@ -203,8 +207,10 @@ class _Processes:
             if isinstance(event, Died):
                 self._worker_died(event)
         elif isinstance(event, Started):
+            self._attempts[event.name], self._last_sign[event.name] = event.attempt, time.monotonic()
             self._on_event(JobStarted(event.name, event.attempt))
         elif isinstance(event, Ended):
+            del self._last_sign[event.name]
             self._running.discard(event.name)
             if event.outcome == job_process.DONE:
                 self._done.add(event.name)
@@ -215,6 +221,7 @@ class _Processes:
     def _pass_on(self, said: Said) -> None:
         report = said.report
         if isinstance(report, Progress):
+            self._last_sign[said.name] = time.monotonic()
             self._on_event(JobProgress(said.name, report.done, report.total, report.metrics))
         elif isinstance(report, Warn):
             self._on_event(JobWarning(said.name, report.text))
@@ -224,7 +231,18 @@ class _Processes:
             self._on_event(JobWarning(said.name, message))
             self._supervisor.kill(report.worker)
 
+    def _kill_hung_jobs(self) -> None:
+        """Kill jobs that have made no progress for too long; they are started again like any that died."""
+        timeout_s = self._runtime.job_timeout_s
+        for job, since in list(self._last_sign.items()):
+            if time.monotonic() - since > timeout_s:
+                message = f"no progress for {timeout_s:g} s (runtime.job_timeout_s); killed"
+                self._on_event(JobWarning(job, message))
+                self._supervisor.kill(f"{job}.{self._attempts[job]}")
+                self._last_sign[job] = time.monotonic()
+
     def _job_died(self, died: Died) -> None:
+        self._last_sign.pop(died.name, None)
         self._on_event(JobFailed(died.name, died.attempt, died.restarts, died.reason))
         first = self._first_reason.setdefault(died.name, died.reason)
         if not died.restarts:

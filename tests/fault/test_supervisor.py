@@ -13,7 +13,7 @@ import pytest
 
 from tests.fakes import STAGES, FakeStage, fake_run, lines, wait_until
 from workers.channels import endpoint_folder
-from workers.engine import Event, JobFailed, LocalEngine, WorkerRestarted
+from workers.engine import Event, JobFailed, JobWarning, LocalEngine, WorkerRestarted
 from workers.messages import Progress
 from workers.supervisor import Died, Ended, Link, Restarts, Said, Started, Supervisor
 from workers.supervisor import Event as ChildEvent
@@ -170,6 +170,17 @@ def test_a_job_that_is_killed_continues_from_its_checkpoint(tmp_path: Path) -> N
     assert "SIGKILL" in failures[0].reason
     assert lines(tmp_path / "killed.began_at") == ["0", "3"]
     assert run.job_artifact("jobs", "killed").sha256 == run.job_artifact("jobs", "a").sha256
+
+
+def test_a_job_that_hangs_is_killed_and_continues_from_its_checkpoint(tmp_path: Path) -> None:
+    run = fake_run(tmp_path, job_timeout_s=4.0)
+    events: list[Event] = []
+    outcome = LocalEngine(1, STAGES).run_jobs(FakeStage(False), run, ["frozen", "a"], events.append, lambda: False)
+    assert outcome.done == ["frozen", "a"] and not outcome.failed
+    warnings = [event for event in events if isinstance(event, JobWarning)]
+    assert [(event.job, "job_timeout_s" in event.message) for event in warnings] == [("frozen", True)]
+    assert lines(tmp_path / "frozen.began_at") == ["0", "3"]
+    assert run.job_artifact("jobs", "frozen").sha256 == run.job_artifact("jobs", "a").sha256
 
 
 def test_a_killed_learner_finds_its_workers_again(tmp_path: Path) -> None:

@@ -1,0 +1,36 @@
+"""A disk that is full while checkpoints and artifacts are written: one clear error, and nothing is lost."""
+
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.runs import MICRO, LiveRun, artifacts, run
+
+pytestmark = pytest.mark.timeout(300)
+SETTINGS = ("baselines=[]", "runtime.max_attempts=1")
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """Give a file system of its own with room for hardly more than the demonstrations."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=900k", "none", str(folder)], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("this user may not mount a file system")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def test_a_full_disk_stops_the_run_and_a_resumed_one_goes_on(small_disk: Path, tmp_path: Path) -> None:
+    run("run", str(MICRO), *SETTINGS, "--run-dir", str(tmp_path / "roomy"), "--workers", "1")
+    code, output = LiveRun(
+        "run", str(MICRO), *SETTINGS, "--run-dir", str(small_disk / "run"), "--workers", "1"
+    ).finish()
+    assert code == 1, output
+    assert "No space left on device" in output and "oodil resume" in output
+    subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
+    run("resume", str(run_dir), "--workers", "1")
+    assert artifacts(run_dir) == artifacts(tmp_path / "roomy")
