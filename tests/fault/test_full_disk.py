@@ -26,9 +26,8 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_full_disk_stops_the_run_and_a_resumed_one_goes_on(small_disk: Path, tmp_path: Path) -> None:
     run("run", str(MICRO), *SETTINGS, "--run-dir", str(tmp_path / "roomy"), "--workers", "1")
-    code, output = LiveRun(
-        "run", str(MICRO), *SETTINGS, "--run-dir", str(small_disk / "run"), "--workers", "1"
-    ).finish()
+    run_dir = small_disk / "run"
+    code, output = LiveRun("run", str(MICRO), *SETTINGS, "--run-dir", str(run_dir), "--workers", "1").finish()
     assert code == 1, output
     assert "No space left on device" in output and "oodil resume" in output
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
