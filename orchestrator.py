@@ -227,6 +227,56 @@ def collect_demos(
     inspect_demos(output)
 
 
+@demos_app.command("convert")
+def convert_demos(
+    sources: Annotated[
+        list[str],
+        typer.Argument(help="FILE.npz, FILE.hdf5 (robomimic), FILE.pkl (released code) or minari:DATASET_ID."),
+    ],
+    environment: Annotated[str, typer.Option(help="Id of the imitator's environment, such as oodil/Hopper-v0.")],
+    output: Annotated[Path, typer.Option(help="The file to write.")] = Path("demonstrations.safetensors"),
+    keys: Annotated[
+        str, typer.Option(help="For observations with several entries: those that make up a state, joined by commas.")
+    ] = "",
+    ends_are_failures: Annotated[
+        bool, typer.Option(help="Episodes that the environment ended are ones in which the demonstrator failed.")
+    ] = False,
+) -> None:
+    """Make one file of demonstrations from files in other formats; each becomes a source, named by its file."""
+    from pipeline.data import Demonstrations
+    from pipeline.datasets import encode_demonstrations
+    from pipeline.datasets.foreign import read_foreign
+
+    parts = []
+    with _bad_input():
+        for source in sources:
+            label = source if source.startswith("minari:") else Path(source).stem
+            chosen = tuple(key for key in keys.split(",") if key)
+            part, recorded = read_foreign(source, label, chosen, ends_are_failures)
+            print(f"{source}: {len(part)} demonstrations" + (f" from {recorded}" if recorded else ""))
+            parts.append(part)
+        output.write_bytes(encode_demonstrations(Demonstrations.joined(parts), environment))
+    inspect_demos(output)
+
+
+@demos_app.command("export")
+def export_demos(
+    run_dir: RunPath,
+    target: Annotated[str, typer.Argument(help="FILE.csv, FILE.hdf5 (robomimic) or minari:DATASET_ID.")],
+) -> None:
+    """Write cluster, transferability and weight of every demonstration to a table, or to where they came from."""
+    from pipeline.datasets.export import export
+    from pipeline.stages.demonstrations import load_demonstrations
+    from walk import read_run
+
+    with _bad_input():
+        opened = read_run(run_dir)
+        arrays = opened.artifact("transferability").arrays("transferability.safetensors")
+        columns = {"cluster": "clusters", "transferability": "scores", "weight": "weights"}
+        found = {name: arrays[held] for name, held in columns.items()}
+        print(export(load_demonstrations(opened), found, target))
+
+
 def _access(bind: str | None, keys: Path | None, workers: int | None) -> "Access | None":
     """Return where other machines may join; refuse to listen without keys, or where it cannot be done."""
     if bind is None and keys is None:

@@ -20,6 +20,18 @@ def offsets_of(lengths: Iterable[int]) -> NDArray[np.int64]:
 
 
 @dataclass(frozen=True)
+class Episode:
+    """One episode from its first state to its last."""
+
+    states: NDArray[np.floating]
+    """(T, S), the first and the last state included."""
+    env_return: float = float("nan")
+    """Sum of the environment's own reward, NaN where unknown."""
+    terminated: bool = False
+    """Whether it ended by failure, as opposed to a time limit or the end of a recording."""
+
+
+@dataclass(frozen=True)
 class Demonstrations:
     """States of N demonstrations of unequal length, one after the other."""
 
@@ -63,8 +75,39 @@ class Demonstrations:
             raise DataError(f"source indices must lie in [0, {len(self.source_labels)})")
 
     @classmethod
+    def of(cls, episodes: list[Episode], label: str) -> "Demonstrations":
+        """Return the states of the episodes of one source. Raises DataError when one does not fit the others."""
+        if not episodes:
+            raise DataError("there is no demonstration")
+        dim = episodes[0].states.shape[-1] if episodes[0].states.ndim == 2 else 0
+        for n, episode in enumerate(episodes):
+            if episode.states.ndim != 2 or not dim or episode.states.shape[1] != dim:
+                raise DataError(
+                    f"demonstration {n} has states of shape {episode.states.shape}; expected (T, {dim or 'S'})"
+                )
+        with np.errstate(over="ignore"):  # What does not fit into 32 bits becomes infinite, and is named below.
+            observations = np.concatenate([episode.states for episode in episodes]).astype(np.float32)
+        return cls(
+            observations=observations,
+            offsets=offsets_of(len(episode.states) for episode in episodes),
+            sources=np.zeros(len(episodes), np.int32),
+            source_labels=(label,),
+            returns=np.array([episode.env_return for episode in episodes]),
+            terminated=np.array([episode.terminated for episode in episodes]),
+        )
+
+    @classmethod
     def joined(cls, parts: "list[Demonstrations]") -> "Demonstrations":
-        """Return the demonstrations of several sets, one after the other; each keeps its own sources."""
+        """Return the demonstrations of several sets, one after the other; each keeps its own sources.
+
+        Raises DataError when their states have different dimensions.
+        """
+        for part in parts:
+            if part.observation_dim != parts[0].observation_dim:
+                raise DataError(
+                    f"{part.source_labels[0]} has states with {part.observation_dim} dimensions; "
+                    f"{parts[0].source_labels[0]} has {parts[0].observation_dim}"
+                )
         first_label = offsets_of(len(part.source_labels) for part in parts).astype(np.int32)
         return cls(
             observations=np.concatenate([part.observations for part in parts]),

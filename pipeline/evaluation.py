@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data import Episode
 from pipeline.environments import MujocoBatch, make_batch
 from pipeline.policy import GaussianPolicy
 from pipeline.seeding import Key, generator
@@ -29,18 +30,6 @@ class Evaluation:
     """(E,)"""
     lengths: NDArray[np.int64]
     """(E,) steps."""
-
-
-@dataclass(frozen=True)
-class Episode:
-    """One episode from reset to end."""
-
-    states: NDArray[np.float32]
-    """(T, S), the first and the last state included."""
-    env_return: float
-    """Sum of the environment's own reward."""
-    terminated: bool
-    """Whether it ended before the time limit."""
 
 
 def run_episodes(

@@ -7,13 +7,11 @@ policy and, beside it, what it reaches.
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pipeline.artifacts import Artifact, Checkpoints, Files, encode_arrays, encode_json, read_artifact
 from pipeline.config import EnvironmentConfig, PpoConfig, TrainingConfig, ValueConfig
-from pipeline.data import DataError, Demonstrations, offsets_of
+from pipeline.data import DataError, Demonstrations, Episode
 from pipeline.environments import make_batch
-from pipeline.evaluation import Episode, run_episodes
+from pipeline.evaluation import run_episodes
 from pipeline.policy import GaussianPolicy
 from pipeline.seeding import derive_key, generator
 from pipeline.stage import JobContext
@@ -102,16 +100,4 @@ def collect_demonstrations(
             )
         context.progress(min(len(kept), count), count)
     share = len(kept) / (rounds * COLLECTION_SIMULATORS)
-    return demonstrations_of(kept[:count], label), share
-
-
-def demonstrations_of(episodes: list[Episode], label: str) -> Demonstrations:
-    """Return the states of the episodes of one source."""
-    return Demonstrations(
-        observations=np.concatenate([episode.states for episode in episodes]),
-        offsets=offsets_of(len(episode.states) for episode in episodes),
-        sources=np.zeros(len(episodes), np.int32),
-        source_labels=(label,),
-        returns=np.array([episode.env_return for episode in episodes]),
-        terminated=np.array([episode.terminated for episode in episodes]),
-    )
+    return Demonstrations.of(kept[:count], label), share

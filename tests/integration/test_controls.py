@@ -14,7 +14,7 @@ from pipeline.data import Demonstrations
 from pipeline.datasets import encode_demonstrations
 from pipeline.environments import make_batch
 from pipeline.evaluation import run_episodes
-from pipeline.experts import demonstrations_of, load_expert
+from pipeline.experts import load_expert
 from pipeline.loading import parse_config
 from pipeline.policy import GaussianPolicy
 from pipeline.seeding import generator
@@ -31,7 +31,7 @@ COUNT = 10
 
 def shown_by(policy: GaussianPolicy, label: str) -> Demonstrations:
     simulators = make_batch("oodil/Hopper-v0", OWN, COUNT)
-    return demonstrations_of(run_episodes(simulators, policy, generator((0,)), stochastic=False), label)
+    return Demonstrations.of(run_episodes(simulators, policy, generator((0,)), stochastic=False), label)
 
 
 def test_an_expert_of_the_own_dynamics_is_transferable_and_doing_nothing_is_not(tmp_path: Path) -> None:

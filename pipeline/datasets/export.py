@@ -1,0 +1,43 @@
+"""What a run found out about each demonstration, written to where the demonstrations came from, or to a table."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from pipeline.data import DataError, Demonstrations
+from pipeline.datasets import minari, robomimic
+
+TARGETS = "FILE.csv (a new table), FILE.hdf5 (masks and attributes) or minari:DATASET_ID (episode metadata)"
+
+
+def export(demonstrations: Demonstrations, found: dict[str, NDArray[Any]], target: str) -> str:
+    """Write cluster, transferability and weight of (N,) demonstrations and return what was done.
+
+    Args:
+        demonstrations: those of the run; an existing target must hold exactly these.
+        found: ``cluster`` int, ``transferability`` and ``weight`` float, (N,) each.
+        target: one of `TARGETS`.
+
+    Raises DataError.
+    """
+    path = Path(target)
+    try:
+        if target.startswith("minari:"):
+            minari.write_metadata(target.removeprefix("minari:"), demonstrations, found)
+            return f"{target}: metadata of {len(demonstrations)} episodes"
+        if path.suffix in (".hdf5", ".h5"):
+            chosen = robomimic.write_masks(path, demonstrations, found)
+            return f"{path}: mask/oodil_transferable with {chosen} of {len(demonstrations)} demonstrations"
+    except ImportError as error:
+        raise DataError(f"{target}: needs {error.name}; pip install 'oodil[data]'") from error
+    if path.suffix != ".csv":
+        raise DataError(f"{target}: unknown format; give {TARGETS}")
+    with open(path, "w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["demonstration", "source", "states", *found])
+        for n, length in enumerate(demonstrations.lengths.tolist()):
+            source = demonstrations.source_labels[demonstrations.sources[n]]
+            table.writerow([n, source, length, *(column[n].item() for column in found.values())])
+    return f"{path}: {len(demonstrations)} rows"

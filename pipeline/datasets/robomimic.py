@@ -1,0 +1,81 @@
+"""HDF5 files as robomimic writes them: ``data/demo_N/obs/KEY``. Needs the extra ``oodil[data]``."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import DataError, Demonstrations, Episode
+
+
+def read(path: Path, keys: tuple[str, ...]) -> tuple[list[Episode], str]:
+    """Return the episodes of a file, in the order of their numbers, and the name of the environment, if it has one.
+
+    Args:
+        path: the file.
+        keys: which low-dimensional observations make up a state, in this order.
+
+    ``next_obs`` gives the last state where it is there. Raises DataError.
+    """
+    import h5py
+
+    try:
+        with h5py.File(path) as file:
+            names = _names(file)
+            available = sorted(file[f"data/{names[0]}/obs"])
+            if not keys:
+                raise DataError(f"observations have entries {', '.join(available)}; choose with --keys")
+            missing = [key for key in keys if key not in available]
+            if missing:
+                raise DataError(f"observations have no entry {missing[0]!r}; there are {', '.join(available)}")
+            return [_episode(file[f"data/{name}"], keys) for name in names], _environment(file)
+    except (OSError, KeyError) as error:
+        raise DataError(f"not a sound robomimic file ({error})") from error
+
+
+def write_masks(path: Path, demonstrations: Demonstrations, columns: Mapping[str, NDArray[Any]]) -> int:
+    """Add filter keys to a file that the demonstrations came from, and return how many are in the first.
+
+    ``mask/oodil_transferable`` names those that weigh more than the average, ``mask/oodil_cluster_K`` the members of
+    each cluster; the columns also become attributes of each demonstration. Raises DataError when the file has another
+    number of demonstrations.
+    """
+    import h5py
+
+    with h5py.File(path, "r+") as file:
+        names = np.array(_names(file))
+        if len(names) != len(demonstrations):
+            raise DataError(f"{path}: has {len(names)} demonstrations; the run has {len(demonstrations)}")
+        transferable = columns["weight"] > columns["weight"].mean()
+        masks = {"oodil_transferable": transferable}
+        masks |= {f"oodil_cluster_{k}": columns["cluster"] == k for k in np.unique(columns["cluster"])}
+        for mask, members in masks.items():
+            if f"mask/{mask}" in file:
+                del file[f"mask/{mask}"]
+            file[f"mask/{mask}"] = np.array(names[members], "S")
+        for n, name in enumerate(names):
+            for column, values in columns.items():
+                file[f"data/{name}"].attrs[f"oodil_{column}"] = values[n]
+        return int(transferable.sum())
+
+
+def _names(file: Any) -> list[str]:
+    return sorted(file["data"], key=lambda name: int(name.rpartition("_")[2]))
+
+
+def _episode(group: Any, keys: tuple[str, ...]) -> Episode:
+    states = _states(group["obs"], keys)
+    if "next_obs" in group:
+        states = np.concatenate((states, _states(group["next_obs"], keys)[-1:]))
+    return Episode(states, float(np.sum(group["rewards"])) if "rewards" in group else float("nan"))
+
+
+def _states(group: Any, keys: tuple[str, ...]) -> NDArray[np.floating]:
+    return np.concatenate([np.asarray(group[key]).reshape(len(group[key]), -1) for key in keys], axis=1)
+
+
+def _environment(file: Any) -> str:
+    return str(json.loads(file["data"].attrs.get("env_args", "{}")).get("env_name", ""))
