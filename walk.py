@@ -21,7 +21,7 @@ from pipeline.artifacts import (
     write_file,
 )
 from pipeline.config import RunConfig
-from pipeline.environments import make_batch
+from pipeline.environments import check_environment
 from pipeline.loading import ConfigError, parse_config
 from pipeline.results import Results, summary
 from pipeline.stage import Run, Stage, is_current
@@ -73,9 +73,9 @@ def read_run(path: Path) -> Run:
 
 def check_inputs(config: RunConfig) -> None:
     """Refuse, before any work, an environment that cannot be made and demonstrations that cannot fit it."""
-    simulators = make_batch(config.environment.id, config.environment.dynamics, 1)
+    simulators = check_environment(config.environment.id, config.environment.dynamics)
     for source in config.demonstrations.sources:
-        make_batch(config.environment.id, source.dynamics, 1)
+        check_environment(config.environment.id, source.dynamics)
     check_demonstrations(config, simulators.observation_dim)
 
 

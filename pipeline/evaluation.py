@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import Episode
-from pipeline.environments import MujocoBatch, make_batch
+from pipeline.environments import Simulators, make_batch
 from pipeline.policy import GaussianPolicy
 from pipeline.seeding import Key, generator
 
@@ -33,7 +33,7 @@ class Evaluation:
 
 
 def run_episodes(
-    simulators: MujocoBatch, policy: GaussianPolicy, rng: np.random.Generator, *, stochastic: bool
+    simulators: Simulators, policy: GaussianPolicy, rng: np.random.Generator, *, stochastic: bool
 ) -> list[Episode]:
     """Run one fresh episode in every simulator side by side."""
     count = simulators.num_simulators

@@ -71,6 +71,8 @@ class Dispatcher:
         self._results: dict[UnitName, UnitResult] = {}
         self._failures: dict[UnitName, dict[str, int]] = {}
         self._durations: deque[float] = deque(maxlen=_RECENT)
+        self._homes: dict[int, str] = {}
+        """The worker that collected a group last; it may still have the group's simulators where they stopped."""
 
     def submit(self, units: list[Unit]) -> None:
         """Take the units of the next iteration. Raises ValueError when those before were not taken."""
@@ -109,6 +111,7 @@ class Dispatcher:
         if name in self._queue:
             self._queue.remove(name)
         self._results[name] = result
+        self._homes[result.group] = worker
 
     def failed(self, worker: str, name: UnitName, traceback: str, now: float) -> None:
         """Note that a unit raised; another worker gets it. Raises CollectError when that happened too often."""
@@ -156,12 +159,16 @@ class Dispatcher:
         return given
 
     def _least_busy(self, name: UnitName) -> str | None:
-        """Return the worker with room that holds least; one on which the unit failed only if there is no other."""
+        """Return the worker with room that holds least, the group's last one if there are several.
+
+        One on which the unit failed is taken only if there is no other.
+        """
         failures = self._failures.get(name, {})
         free = [worker for worker, state in self._workers.items() if len(state.held) < UNITS_PER_WORKER]
         if any(worker not in failures for worker in self._workers):
             free = [worker for worker in free if worker not in failures]
-        return min(free, key=lambda worker: len(self._workers[worker].held), default=None)
+        home = self._homes.get(name[1])
+        return min(free, key=lambda worker: (len(self._workers[worker].held), worker != home), default=None)
 
     def _last_given(self) -> dict[UnitName, float]:
         """Return when each missing unit that some worker holds was given away last."""

@@ -87,7 +87,8 @@ class PolicyNetwork(nn.Module):
         """Return a copy for rollout workers."""
         layers = self.net.layers
         return GaussianPolicy(
-            weights=tuple(np.ascontiguousarray(layer.weight.detach().numpy().T) for layer in layers),
+            # A plain ascontiguousarray would not copy a column, which would then change while it is being sent.
+            weights=tuple(np.array(layer.weight.detach().numpy().T, order="C") for layer in layers),
             biases=tuple(layer.bias.detach().numpy().copy() for layer in layers),
             log_std=self.log_std.detach().numpy().copy(),
             input_mean=self.input_mean.numpy().copy(),

@@ -9,7 +9,8 @@ from typing import Any
 
 import gymnasium
 
-from pipeline.environments.batch import MujocoBatch, Snapshot
+from pipeline.environments.batch import MujocoBatch, Simulators, Snapshot
+from pipeline.environments.replay import ReplayBatch, refuse_randomness
 
 MAX_EPISODE_STEPS = 1000
 
@@ -24,29 +25,43 @@ for _id, _class in {
         )
 
 
-def make_batch(env_id: str, dynamics: Mapping[str, float], num_simulators: int) -> MujocoBatch:
+def make_batch(env_id: str, dynamics: Mapping[str, float], num_simulators: int) -> Simulators:
     """Build a batch of simulators of a registered environment with the given dynamics.
 
-    Raises ValueError for an id that is not registered, dynamics that the environment does not have, or a task without
-    a batched form.
+    Our own environments have a fast batched form; any other is stepped through Gymnasium (`ReplayBatch`). An id of the
+    form ``module:Id`` imports the module that registers it.
+
+    Raises ValueError for an id that is not registered, dynamics that the environment does not have, an environment
+    without a time limit, or spaces that are no boxes.
     """
     try:
         arguments: dict[str, Any] = dict(dynamics)
-        env = gymnasium.make(env_id, **arguments)
+        env = gymnasium.make(env_id, disable_env_checker=True, **arguments)
     except gymnasium.error.Error as error:
+        raise ValueError(f"environment {env_id!r} cannot be made: {error}") from error
+    except ModuleNotFoundError as error:
         raise ValueError(f"environment {env_id!r} cannot be made: {error}") from error
     except TypeError as error:
         raise ValueError(f"environment {env_id!r} does not take the dynamics {dict(dynamics)}: {error}") from error
     task: Any = env.unwrapped
-    if not hasattr(task, "batch_healthy"):
-        raise ValueError(f"environment {env_id!r} has no batched form; those that have are {', '.join(batched_ids())}")
-    assert env.spec is not None and env.spec.max_episode_steps is not None
-    return MujocoBatch(task, num_simulators, env.spec.max_episode_steps)
+    limit = env.spec.max_episode_steps if env.spec is not None else None
+    if limit is None:
+        raise ValueError(f"environment {env_id!r} has no time limit; register it with max_episode_steps")
+    if hasattr(task, "batch_healthy"):
+        return MujocoBatch(task, num_simulators, limit)
+    others = [gymnasium.make(env_id, disable_env_checker=True, **arguments) for _ in range(num_simulators - 1)]
+    try:
+        return ReplayBatch([env, *others], limit)
+    except ValueError as error:
+        raise ValueError(f"environment {env_id!r}: {error}") from error
 
 
-def batched_ids() -> list[str]:
-    """Return the ids of the environments that have a batched form."""
-    return sorted(env_id for env_id in gymnasium.registry if env_id.startswith("oodil/"))
+def check_environment(env_id: str, dynamics: Mapping[str, float]) -> Simulators:
+    """Return one simulator of an environment. Raises ValueError when it cannot be made or is not deterministic."""
+    simulators = make_batch(env_id, dynamics, 1)
+    if isinstance(simulators, ReplayBatch):
+        refuse_randomness(simulators, env_id)
+    return simulators
 
 
-__all__ = ["MujocoBatch", "Snapshot", "batched_ids", "make_batch"]
+__all__ = ["Simulators", "Snapshot", "check_environment", "make_batch"]

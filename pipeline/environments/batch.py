@@ -1,11 +1,12 @@
-"""Many MuJoCo simulators of one model, stepped together in one process at the speed of raw ``mj_step``.
+"""Batches of simulators: what all have in common, and MuJoCo's at the speed of raw ``mj_step``.
 
-Letters: G simulators, S observation, A action. The batch agrees to the last bit with one Gymnasium environment per
+Letters: G simulators, S observation, A action. A MuJoCo batch agrees to the last bit with one Gymnasium environment per
 simulator, and can be saved and restored in the middle of an episode: `mjSTATE_INTEGRATION` holds all that the next step
 depends on (`mjSTATE_FULLPHYSICS` does not: it leaves out the solver's warm start).
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -22,7 +23,7 @@ class Snapshot:
     """Everything that the future of G simulators depends on."""
 
     states: NDArray[np.float64]
-    """(G, mj_stateSize) integration states."""
+    """(G, N); what it means is the batch's own affair. MuJoCo's integration states, or a seed and actions."""
     elapsed_steps: NDArray[np.int64]
     """(G,) steps since the last reset."""
     episode_returns: NDArray[np.float64]
@@ -36,6 +37,36 @@ class StepOutcome:
     env_rewards: NDArray[np.float64]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
+
+
+class Simulators(Protocol):
+    """G simulators of one task, stepped together; the caller decides when an ended one is reset."""
+
+    num_simulators: int
+    max_episode_steps: int
+    observation_dim: int
+    action_dim: int
+
+    def observations(self) -> NDArray[np.float64]:
+        """Return (G, S) observations of the present states."""
+
+    def reset(self, simulator: int, seed: int) -> None:
+        """Start a new episode in one simulator."""
+
+    def step(self, actions: NDArray[np.floating]) -> StepOutcome:
+        """Apply (G, A) actions for one control step."""
+
+    def elapsed_steps(self) -> NDArray[np.int64]:
+        """Return (G,) steps since the last reset of each simulator."""
+
+    def episode_returns(self) -> NDArray[np.float64]:
+        """Return (G,) sums of the environment's own reward since the last reset; for evaluation only."""
+
+    def snapshot(self) -> Snapshot:
+        """Save all simulators; `restore` continues from here to the same bits."""
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Continue from a snapshot of a batch of the same size and task."""
 
 
 class MujocoBatch:

@@ -58,7 +58,7 @@ def config_for(tmp_path: Path):
         ("seed=soon", "seed: Input should be a valid integer"),
         ("clustering.temperature=-1", "clustering.temperature: Input should be greater than 0, got -1"),
         ("environment.id=oodil/Hoper-v0", "oodil/Hoper-v0"),
-        ("environment={id: CartPole-v1}", "no batched form"),
+        ("environment={id: CartPole-v1}", "the action space is Discrete(2); only Box spaces can be used"),
         ("environment.dynamics.gravty=9", "gravty"),
         ("environment.dynamics.gravity=-9", "gravity is -9.0; it must be positive"),
         ("nonsense", "not of the form key=value"),
