@@ -184,6 +184,28 @@ def evaluate(
         print(f"{path}: one episode, return {env_return:.1f}")
 
 
+@app.command()
+def bench(
+    config_path: ConfigPath,
+    overrides: Overrides = None,
+    workers: Annotated[list[int] | None, typer.Option("--workers", "-w", min=0, help="Repeat for several.")] = None,
+) -> None:
+    """Find the number of workers with which the learner is fastest here; takes about a minute."""
+    from bench import compare, worker_counts
+    from pipeline.loading import load_config
+    from terminal import print_bench
+    from walk import check_inputs
+
+    with _bad_input():
+        config = load_config(config_path, overrides)
+        check_inputs(config)
+
+    def show(count: int, figures: dict[str, float]) -> None:
+        print(f"{count} workers: {figures['steps_per_s']:,.0f} environment steps per second", file=sys.stderr)
+
+    print_bench(config.environment.id, compare(config, sorted(set(workers or worker_counts())), show))
+
+
 @demos_app.command("inspect")
 def inspect_demos(path: Annotated[Path, typer.Argument(help="A file of demonstrations, or a run's folder.")]) -> None:
     """Show what a set of demonstrations contains."""

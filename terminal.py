@@ -1,5 +1,6 @@
 """How a run looks in a terminal: live progress, plain lines elsewhere, tables at the end."""
 
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -202,4 +203,18 @@ def print_demonstrations(path: Path, demonstrations: "Demonstrations", environme
             returns = demonstrations.returns[mine]
             shown = f"{returns.mean():,.0f} ± {returns.std():,.0f}" if np.isfinite(returns).all() else "not recorded"
             table.add_row(label, str(counts[i]), f"{lengths[mine].min()} - {lengths[mine].max()}", shown)
+    console.print(table)
+
+
+def print_bench(environment: str, results: dict[int, dict[str, float]]) -> None:
+    """Print environment steps per second by number of workers, and which is best."""
+    best = max(results, key=lambda workers: results[workers]["steps_per_s"])
+    slowest = min(figures["steps_per_s"] for figures in results.values())
+    table = Table("workers", "steps per second", "times the slowest", "", box=None, padding=(0, 2))
+    for workers, figures in results.items():
+        rate = figures["steps_per_s"]
+        name = f"{workers} (inline)" if workers == 0 else str(workers)
+        table.add_row(name, f"{rate:,.0f}", f"{rate / slowest:.2f}", "◀ --workers" if workers == best else "")
+    console = Console()
+    console.print(f"{environment}: one learner and its rollout workers, {os.cpu_count()} cores", highlight=False)
     console.print(table)

@@ -20,7 +20,6 @@ import platform
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -32,24 +31,16 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.algorithms.gail import AdversarialReward
-from pipeline.algorithms.learner import Learner
-from pipeline.artifacts import Files, RunDirectory
+from bench import learner_rate
 from pipeline.config import PpoConfig, RunConfig
-from pipeline.data import Demonstrations
 from pipeline.environments import Snapshot, make_batch
 from pipeline.environments.batch import STATE
 from pipeline.loading import parse_config
-from pipeline.stage import JobContext, Run, Stage
-from pipeline.training import train
 from pipeline.versions import library_versions
-from workers.engine import Event, JobFailed, JobProgress, LocalEngine
 
 ENVIRONMENTS = ("oodil/Hopper-v0", "oodil/Walker2d-v0", "oodil/HalfCheetah-v0")
 SIMULATORS = 16
 STEPS_PER_ROUND = 50
-WARM_UP = 0.3
-"""Share of a learner's run that is not counted: processes start, and untrained robots fall all the time."""
 RAW_SECONDS = 3.0
 IMITATION_BATCH, IMITATION_EPOCHS, IMITATION_MINIBATCH = 2560, 5, 512
 IMITATION_SETUP = """\
@@ -144,55 +135,6 @@ def raw_rate(env_id: str) -> float:
     return steps / seconds
 
 
-class LearnerLoop(Stage):
-    """The training of the imitation stage without anything around it."""
-
-    name = "loop"
-    version = 1
-    inputs: tuple[str, ...] = ()
-    distributed = True
-
-    def settings(self, config: RunConfig) -> dict[str, Any]:
-        """Return nothing: no artifact of it is ever reused."""
-        return {}
-
-    def run_job(self, run: Run, job: str, context: JobContext) -> Files:
-        """Train and forget."""
-        environment, gail = run.config.environment, run.config.imitation.gail
-        demonstrations = random_demonstrations(environment.id)
-        weights = np.linspace(0.1, 1.0, len(demonstrations))
-        simulators = make_batch(environment.id, environment.dynamics, 1)
-        reward = AdversarialReward(demonstrations, weights, simulators.max_episode_steps, gail.discriminator, 0)
-        learner = Learner(simulators.observation_dim, simulators.action_dim, gail, reward, 0)
-        train(learner, environment, gail, [], context, self.checkpoints(run, job))
-        return {}
-
-
-def stage_named(config: RunConfig, name: str) -> Stage:
-    """Return the only stage there is; the engine's processes find it here."""
-    return LearnerLoop()
-
-
-def random_demonstrations(env_id: str, count: int = 10, num_states: int = 1001) -> Demonstrations:
-    """Return demonstrations of random actions: what is imitated does not matter for speed, only how much of it."""
-    batch = make_batch(env_id, {}, count)
-    rng = np.random.default_rng(0)
-    for n in range(count):
-        batch.reset(n, seed=n)
-    states = np.empty((count, num_states, batch.observation_dim), np.float32)
-    for t in range(num_states):
-        states[:, t] = batch.observations()
-        batch.step(rng.uniform(-1, 1, (count, batch.action_dim)))
-    return Demonstrations(
-        observations=states.reshape(-1, batch.observation_dim),
-        offsets=np.arange(count + 1) * num_states,
-        sources=np.zeros(count, np.int32),
-        source_labels=("random",),
-        returns=np.full(count, np.nan),
-        terminated=np.zeros(count, np.bool_),
-    )
-
-
 def run_config(env_id: str, total_steps: int, **gail: Any) -> RunConfig:
     """Return a configuration that differs from the defaults in ``gail`` alone."""
     gail = {"total_steps": total_steps} | gail
@@ -204,27 +146,6 @@ def run_config(env_id: str, total_steps: int, **gail: Any) -> RunConfig:
         "imitation": {"gail": gail},
     }
     return parse_config(values, "throughput")
-
-
-def learner_rate(config: RunConfig, workers: int) -> dict[str, float]:
-    """Return steps per second of the learner loop after its warm-up, and the mean episode length at its end."""
-    seen: list[tuple[float, JobProgress]] = []
-
-    def on_event(event: Event) -> None:
-        if isinstance(event, JobProgress):
-            seen.append((time.perf_counter(), event))
-        elif isinstance(event, JobFailed):
-            raise RuntimeError(event.reason)
-
-    with tempfile.TemporaryDirectory() as folder:
-        run = Run(config, RunDirectory(Path(folder)))
-        run.directory.config.write_text(config.model_dump_json())
-        engine = LocalEngine(workers, "benchmarks.throughput:stage_named")
-        engine.run_jobs(LearnerLoop(), run, ["loop"], on_event, lambda: False)
-    timed = [(at, event) for at, event in seen if event.done >= WARM_UP * event.total]
-    (start, first), (end, last) = timed[0], timed[-1]
-    length = last.metrics.get("length", float("nan"))
-    return {"steps_per_s": (last.done - first.done) / (end - start), "episode_length": length}
 
 
 def learner(env_id: str, workers: int, total_steps: int, rounds: int, cores: int) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def packages(tree: ast.Module) -> set[str]:
 
 def forbidden_imports(name: str, tree: ast.Module) -> set[str]:
     """Return what a file imports against the order orchestrator -> workers -> pipeline."""
-    top = {"orchestrator", "walk", "terminal"}
+    top = {"orchestrator", "walk", "terminal", "bench"}
     above = {"pipeline": {"workers", *top}, "workers": top}
     return packages(tree) & above.get(name.split("/")[0], {"orchestrator"})
 

@@ -1,0 +1,117 @@
+"""How fast the learner loop of a configuration runs on this machine, by the number of rollout workers."""
+
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.artifacts import Files, RunDirectory
+from pipeline.config import RunConfig
+from pipeline.data import Demonstrations
+from pipeline.environments import make_batch
+from pipeline.stage import JobContext, Run, Stage
+from workers.engine import Event, JobFailed, JobProgress, LocalEngine
+
+WARM_UP = 0.3
+"""Share of a learner's run that is not counted: processes start, and untrained robots fall all the time."""
+ITERATIONS = 60
+"""Of the learner, for each number of workers that `compare` tries."""
+
+
+def compare(
+    config: RunConfig, counts: list[int], on_result: Callable[[int, dict[str, float]], None]
+) -> dict[int, dict[str, float]]:
+    """Measure each number of workers in turn; see `learner_rate`."""
+    gail = config.imitation.gail
+    short = gail.model_copy(update={"total_steps": ITERATIONS * gail.steps_per_iteration})
+    shortened = config.model_copy(update={"imitation": config.imitation.model_copy(update={"gail": short})})
+    results = {}
+    for workers in counts:
+        results[workers] = learner_rate(shortened, workers)
+        on_result(workers, results[workers])
+    return results
+
+
+def worker_counts() -> list[int]:
+    """Return the numbers of workers worth trying here: none, and powers of two up to the number of cores."""
+    cores = os.cpu_count() or 1
+    return [0, *(2**i for i in range(cores.bit_length()) if 2**i <= cores)]
+
+
+def learner_rate(config: RunConfig, workers: int) -> dict[str, float]:
+    """Return steps per second of the learner loop after its warm-up, and the mean episode length at its end."""
+    seen: list[tuple[float, JobProgress]] = []
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, JobProgress):
+            seen.append((time.perf_counter(), event))
+        elif isinstance(event, JobFailed):
+            raise RuntimeError(event.reason)
+
+    with tempfile.TemporaryDirectory() as folder:
+        run = Run(config, RunDirectory(Path(folder)))
+        run.directory.config.write_text(config.model_dump_json())
+        engine = LocalEngine(workers, "bench:stage_named")
+        engine.run_jobs(LearnerLoop(), run, ["loop"], on_event, lambda: False)
+    timed = [(at, event) for at, event in seen if event.done >= WARM_UP * event.total]
+    (start, first), (end, last) = timed[0], timed[-1]
+    length = last.metrics.get("length", float("nan"))
+    return {"steps_per_s": (last.done - first.done) / (end - start), "episode_length": length}
+
+
+class LearnerLoop(Stage):
+    """The training of the imitation stage without anything around it."""
+
+    name = "loop"
+    version = 1
+    inputs: tuple[str, ...] = ()
+    distributed = True
+
+    def settings(self, config: RunConfig) -> dict[str, Any]:
+        """Return nothing: no artifact of it is ever reused."""
+        return {}
+
+    def run_job(self, run: Run, job: str, context: JobContext) -> Files:
+        """Train and forget."""
+        from pipeline.algorithms.gail import AdversarialReward
+        from pipeline.algorithms.learner import Learner
+        from pipeline.training import train
+
+        environment, gail = run.config.environment, run.config.imitation.gail
+        demonstrations = random_demonstrations(environment.id)
+        weights = np.linspace(0.1, 1.0, len(demonstrations))
+        simulators = make_batch(environment.id, environment.dynamics, 1)
+        reward = AdversarialReward(demonstrations, weights, simulators.max_episode_steps, gail.discriminator, 0)
+        learner = Learner(simulators.observation_dim, simulators.action_dim, gail, reward, 0)
+        train(learner, environment, gail, [], context, self.checkpoints(run, job))
+        return {}
+
+
+def stage_named(config: RunConfig, name: str) -> Stage:
+    """Return the only stage there is; the engine's processes find it here."""
+    return LearnerLoop()
+
+
+def random_demonstrations(env_id: str, count: int = 10) -> Demonstrations:
+    """Return demonstrations of random actions: what is imitated does not matter for speed, only how much of it."""
+    batch = make_batch(env_id, {}, count)
+    num_states = batch.max_episode_steps + 1
+    rng = np.random.default_rng(0)
+    for n in range(count):
+        batch.reset(n, seed=n)
+    states = np.empty((count, num_states, batch.observation_dim), np.float32)
+    for t in range(num_states):
+        states[:, t] = batch.observations()
+        batch.step(rng.uniform(-1, 1, (count, batch.action_dim)))
+    return Demonstrations(
+        observations=states.reshape(-1, batch.observation_dim),
+        offsets=np.arange(count + 1) * num_states,
+        sources=np.zeros(count, np.int32),
+        source_labels=("random",),
+        returns=np.full(count, np.nan),
+        terminated=np.zeros(count, np.bool_),
+    )
