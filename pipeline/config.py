@@ -277,7 +277,7 @@ class TransferabilityConfig(_Section):
     """Times the demonstrations are scored while a job runs, evenly spaced."""
     averaged_scores: PositiveInt = 5
     """Window of the moving average of scores, of whose last third the most convinced decides."""
-    sharpening: float = Field(default=3.0, gt=0.0)
+    sharpening: float = Field(default=4.0, gt=0.0)
     """Power to which a transferability is raised to become a weight; 1 is the paper's form (docs/decisions.md)."""
 
     @model_validator(mode="before")

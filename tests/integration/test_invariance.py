@@ -33,7 +33,7 @@ def test_a_finished_run_is_reused_and_a_changed_field_recomputes_what_follows(in
     output = run("run", str(MICRO), NAIVE, "--run-dir", str(inline), "--workers", "0")
     assert output.count("reused") == len(before)
     output = run("run", str(MICRO), NAIVE, "transferability.sharpening=1", "--run-dir", str(inline), "--workers", "0")
-    assert "transferability: recomputed: sharpening 3.0 -> 1.0" in output
+    assert "transferability: recomputed: sharpening 4.0 -> 1.0" in output
     assert "imitation: recomputed: its input transferability changed" in output
     assert "clustering: reused" in output and "naive_gail: reused" in output
     run("run", str(MICRO), NAIVE, "--run-dir", str(inline), "--workers", "0")
