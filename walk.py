@@ -114,7 +114,7 @@ def _bring_up(
     elif resumed:
         reason = "resumed from checkpoint" + ("" if resumed == [stage.name] else f" ({', '.join(resumed)})")
     display.stage_started(stage.name, reason, len(pending))
-    _record(run.directory, "stage_started", stage=stage.name, reason=reason, workers=workers)
+    _record(run.directory, "stage_started", stage=stage.name, reason=reason, workers=workers, jobs=len(pending))
     outcome = engine.run_jobs(stage, run, pending, display.event, should_stop)
     if outcome.stopped or outcome.failed:
         _record(run.directory, "stage_interrupted", stage=stage.name, seconds=time.monotonic() - started)
@@ -123,7 +123,7 @@ def _bring_up(
     if files is not None:
         write_artifact(path, origin, files, library_versions())
     seconds = time.monotonic() - started
-    _record(run.directory, "stage_finished", stage=stage.name, seconds=seconds, workers=workers)
+    _record(run.directory, "stage_finished", stage=stage.name, seconds=seconds, workers=workers, jobs=len(pending))
     display.stage_finished(stage.name, seconds)
 
 

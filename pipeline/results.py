@@ -72,13 +72,24 @@ class Results:
         return {stage: steps[stage] for stage in STAGES if steps.get(stage) is not None}
 
     def seconds(self) -> dict[str, float]:
-        """Return how long each stage took when it was last finished."""
-        found: dict[str, float] = {}
+        """Return how long each finished stage took, with what was spent on it before an interruption.
+
+        A stage that is computed again counts anew, unless its jobs were reused: reading their scores in another way
+        takes no time, and says nothing of the time that they took.
+        """
+        spent: dict[str, float] = {}
+        finished: set[str] = set()
         for event in _events(self.run):
             stage, seconds = event.get("stage"), event.get("seconds")
-            if event.get("event") == "stage_finished" and isinstance(stage, str) and isinstance(seconds, int | float):
-                found[stage] = float(seconds)
-        return found
+            if not isinstance(stage, str):
+                continue
+            if event.get("event") == "stage_started" and stage in finished and event.get("jobs") != 0:
+                spent[stage] = 0.0
+            if event.get("event") in ("stage_finished", "stage_interrupted") and isinstance(seconds, int | float):
+                spent[stage] = spent.get(stage, 0.0) + float(seconds)
+            if event.get("event") == "stage_finished":
+                finished.add(stage)
+        return {stage: seconds for stage, seconds in spent.items() if stage in finished}
 
 
 def summary(run: Run) -> dict[str, float]:

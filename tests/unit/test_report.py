@@ -464,9 +464,19 @@ def test_a_failed_write_leaves_the_old_report(tmp_path: Path, monkeypatch: pytes
 def test_stage_times_are_those_of_the_last_run(tmp_path: Path) -> None:
     run = new_run(tmp_path, ["a"], [3])
     lines = [
-        {"event": "stage_finished", "stage": "clustering", "seconds": 50.0},
+        {"event": "stage_interrupted", "stage": "clustering", "seconds": 20.0},
+        {"event": "stage_started", "stage": "clustering", "jobs": 1},
         {"event": "stage_finished", "stage": "clustering", "seconds": 30.0},
+        {"event": "stage_started", "stage": "transferability", "jobs": 5},
+        {"event": "stage_finished", "stage": "transferability", "seconds": 300.0},
+        {"event": "stage_started", "stage": "transferability", "jobs": 0},
+        {"event": "stage_finished", "stage": "transferability", "seconds": 0.5},
+        {"event": "stage_started", "stage": "imitation", "jobs": 1},
+        {"event": "stage_finished", "stage": "imitation", "seconds": 90.0},
+        {"event": "stage_started", "stage": "imitation", "jobs": 1},
+        {"event": "stage_finished", "stage": "imitation", "seconds": 70.0},
+        {"event": "stage_interrupted", "stage": "naive_gail", "seconds": 5.0},
         {"event": "stage_failed", "stage": "clustering", "seconds": 7.0},
     ]
     run.directory.events.write_text("\n".join(map(json.dumps, lines)))
-    assert Results(run).seconds() == {"clustering": 30.0}
+    assert Results(run).seconds() == {"clustering": 50.0, "transferability": 300.5, "imitation": 70.0}
