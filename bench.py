@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.artifacts import Files, RunDirectory
 from pipeline.config import RunConfig
-from pipeline.data import Demonstrations
+from pipeline.data import Demonstrations, Episode
 from pipeline.environments import make_batch
 from pipeline.stage import JobContext, Run, Stage
 from workers.engine import Event, JobFailed, JobProgress, LocalEngine
@@ -107,11 +107,4 @@ def random_demonstrations(env_id: str, count: int = 10) -> Demonstrations:
     for t in range(num_states):
         states[:, t] = batch.observations()
         batch.step(rng.uniform(-1, 1, (count, batch.action_dim)))
-    return Demonstrations(
-        observations=states.reshape(-1, batch.observation_dim),
-        offsets=np.arange(count + 1) * num_states,
-        sources=np.zeros(count, np.int32),
-        source_labels=("random",),
-        returns=np.full(count, np.nan),
-        terminated=np.zeros(count, np.bool_),
-    )
+    return Demonstrations.of([Episode(part) for part in states], "random")

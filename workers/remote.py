@@ -6,14 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from workers import rollout as rollout_process
-from workers.supervisor import Died, Restarts, Started, Supervisor
+from workers.supervisor import Died, Ended, Restarts, Started, Supervisor
 
 _POLL_S = 0.2
 _RESTARTS, _DELAY_S = 1_000_000, 1.0
 
 
 class WorkersError(RuntimeError):
-    """No worker is left; the message has the last traceback."""
+    """The learner does not want these workers; the message says why."""
 
 
 def serve(
@@ -33,7 +33,7 @@ def serve(
             for event in supervisor.poll(_POLL_S):
                 if isinstance(event, Started):
                     say(f"{host}{event.name}: collects for {address}")
+                elif isinstance(event, Ended):
+                    raise WorkersError(event.outcome)
                 elif isinstance(event, Died):
-                    if rollout_process.RefusedError.__name__ in event.reason:
-                        raise WorkersError(event.reason)
                     say(f"{host}{event.name}: {event.reason}; started again")

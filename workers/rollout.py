@@ -27,25 +27,20 @@ READY_INTERVAL_S = 1.0
 _POLL_S = 0.1
 
 
-class RefusedError(RuntimeError):
-    """The learner does not want this worker; the message says why."""
-
-
 def main(link: Link, endpoint: str, run_id: str = "", host: str = "", keys: str = "") -> str:
-    """Collect units for whichever learner is behind the endpoint, until asked to stop.
+    """Collect units for whichever learner is behind the endpoint, until asked to stop or refused; return which.
 
     On another machine, ``host`` makes the worker's name unlike all others, and it works for any run.
     """
     name = host + link.identity
     channel = Dealer(endpoint, name, Path(keys) if keys else None)
     try:
-        _serve(channel, link, name, run_id)
+        return _serve(channel, link, name, run_id)
     finally:
         channel.close()
-    return "stopped"
 
 
-def _serve(channel: Dealer, link: Link, name: str, run_id: str) -> None:
+def _serve(channel: Dealer, link: Link, name: str, run_id: str) -> str:
     sequence = itertools.count()
     versions = collecting_versions()
     next_ready = time.monotonic()
@@ -62,13 +57,14 @@ def _serve(channel: Dealer, link: Link, name: str, run_id: str) -> None:
             logging.warning("message dropped: %s", error)
             continue
         if isinstance(message, Refused):
-            raise RefusedError(message.reason)
+            return f"refused: {message.reason}"
         if not isinstance(message, UnitMessage) or run_id not in ("", message.header.run_id):
             logging.warning("message dropped: no unit of run %s", run_id)
             continue
         asked = message.header
         channel.send(_answer(message, Header(asked.run_id, asked.incarnation, name, next(sequence))))
         next_ready = time.monotonic() + READY_INTERVAL_S
+    return "stopped"
 
 
 def _answer(message: UnitMessage, header: Header) -> list[bytes]:

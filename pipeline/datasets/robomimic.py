@@ -32,7 +32,9 @@ def read(path: Path, keys: tuple[str, ...]) -> tuple[list[Episode], str]:
             if missing:
                 raise DataError(f"observations have no entry {missing[0]!r}; there are {', '.join(available)}")
             return [_episode(file[f"data/{name}"], keys) for name in names], _environment(file)
-    except (OSError, KeyError) as error:
+    except DataError:
+        raise
+    except (OSError, KeyError, ValueError, IndexError) as error:
         raise DataError(f"not a sound robomimic file ({error})") from error
 
 

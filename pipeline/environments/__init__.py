@@ -37,9 +37,7 @@ def make_batch(env_id: str, dynamics: Mapping[str, float], num_simulators: int) 
     try:
         arguments: dict[str, Any] = dict(dynamics)
         env = gymnasium.make(env_id, disable_env_checker=True, **arguments)
-    except gymnasium.error.Error as error:
-        raise ValueError(f"environment {env_id!r} cannot be made: {error}") from error
-    except ModuleNotFoundError as error:
+    except (gymnasium.error.Error, ModuleNotFoundError) as error:
         raise ValueError(f"environment {env_id!r} cannot be made: {error}") from error
     except TypeError as error:
         raise ValueError(f"environment {env_id!r} does not take the dynamics {dict(dynamics)}: {error}") from error

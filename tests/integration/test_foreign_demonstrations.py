@@ -174,6 +174,10 @@ def test_entries_have_to_be_chosen_and_to_exist(robomimic_file: Path, minari_id:
         read_foreign(str(robomimic_file), "lab", (), ends_are_failures=False)
     with pytest.raises(DataError, match="no entry 'leg'; there are arm, box"):
         read_foreign(str(robomimic_file), "lab", ("arm", "leg"), ends_are_failures=False)
+    with h5py.File(robomimic_file, "r+") as file:
+        del file["data/demo_0"], file["data/demo_2"], file["data/demo_10"]
+    with pytest.raises(DataError, match="not a sound robomimic file"):
+        read_foreign(str(robomimic_file), "lab", ("arm",), ends_are_failures=False)
     with pytest.raises(DataError, match="not a local Minari data set"):
         read_foreign("minari:nobody/nothing-v0", "lab", (), ends_are_failures=False)
 

@@ -177,3 +177,19 @@ def test_keys_are_made_once_and_kept_from_others(access: Access) -> None:
     os.chmod(own / "worker.secret", 0o600)
     with pytest.raises(KeysError, match="is no key, which has 40 characters"):
         client_keys(own)
+
+
+def test_a_worker_with_other_libraries_ends_with_the_reason(
+    access: Access, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from workers import learner as learner_module
+
+    monkeypatch.setattr(learner_module, "collecting_versions", lambda: "mujoco 0.0.0")
+    remote = remote_worker(access, create_worker_keys(access.keys, "elsewhere", new_key_pair), tmp_path / "logs")
+    source = learner_module.ZmqRollouts(f"ipc://{tmp_path}/s", "a run", "learner.1", 60.0, access=access)
+    try:
+        output, _ = remote.communicate(timeout=30)
+        assert remote.returncode == 1 and "refused: this worker has" in output and "mujoco 0.0.0" in output
+    finally:
+        source.close()
+        remote.kill()

@@ -461,7 +461,7 @@ def test_a_failed_write_leaves_the_old_report(tmp_path: Path, monkeypatch: pytes
     assert path.read_bytes() == before
 
 
-def test_stage_times_are_those_of_the_last_run(tmp_path: Path) -> None:
+def test_stage_times_are_those_of_the_last_computation(tmp_path: Path) -> None:
     run = new_run(tmp_path, ["a"], [3])
     lines = [
         {"event": "stage_interrupted", "stage": "clustering", "seconds": 20.0},
