@@ -123,7 +123,7 @@ def _bring_up(
     if files is not None:
         write_artifact(path, origin, files, library_versions())
     seconds = time.monotonic() - started
-    _record(run.directory, "stage_finished", stage=stage.name, seconds=seconds, workers=workers, jobs=len(pending))
+    _record(run.directory, "stage_finished", stage=stage.name, seconds=seconds, workers=workers)
     display.stage_finished(stage.name, seconds)
 
 
