@@ -25,7 +25,9 @@ class ValueFunction(nn.Module):
         """Regress ``targets`` (B,) on ``inputs`` (B, S), each epoch in fresh random minibatches."""
         loss = torch.zeros(())
         for _ in range(self.config.epochs):
-            for chosen in torch.randperm(len(inputs), generator=rng).split(self.config.minibatch_size):
-                loss = (self(inputs[chosen]) - targets[chosen]).square().mean()
+            order = torch.randperm(len(inputs), generator=rng)
+            size = self.config.minibatch_size
+            for some_inputs, some_targets in zip(inputs[order].split(size), targets[order].split(size), strict=True):
+                loss = (self(some_inputs) - some_targets).square().mean()
                 self.optimiser.step(loss)
         return {"value_loss": float(loss.detach())}

@@ -45,7 +45,7 @@ def make_batch(env_id: str, dynamics: Mapping[str, float], num_simulators: int) 
     limit = env.spec.max_episode_steps if env.spec is not None else None
     if limit is None:
         raise ValueError(f"environment {env_id!r} has no time limit; register it with max_episode_steps")
-    if hasattr(task, "batch_healthy"):
+    if hasattr(task, "healthy_bounds"):
         return MujocoBatch(task, num_simulators, limit)
     others = [gymnasium.make(env_id, disable_env_checker=True, **arguments) for _ in range(num_simulators - 1)]
     try:

@@ -82,18 +82,22 @@ class MujocoBatch:
         self._controls = [data.ctrl for data in self._data]
         self._positions = [data.qpos for data in self._data]
         self._velocities = [data.qvel for data in self._data]
-        self._qpos = np.zeros((num_simulators, self.model.nq))
-        self._qvel = np.zeros((num_simulators, self.model.nv))
+        nq, nv = self.model.nq, self.model.nv
+        self._states = np.zeros((num_simulators, nq + nv))
+        self._qpos, self._qvel = self._states[:, :nq], self._states[:, nq:]
+        self._healthy_above, self._healthy_below = env.healthy_bounds()
         self._elapsed = np.zeros(num_simulators, np.int64)
         self._returns = np.zeros(num_simulators)
-        self.observation_dim = self.model.nq + self.model.nv
+        self.observation_dim = nq + nv
         self.action_dim = self.model.nu
 
     def observations(self) -> NDArray[np.float64]:
         """Return (G, S) observations of the present states."""
-        limit = self.env.velocity_limit
-        velocity = self._qvel if limit == np.inf else np.clip(self._qvel, -limit, limit)
-        return np.concatenate((self._qpos, velocity), axis=1)
+        states, limit = self._states.copy(), self.env.velocity_limit
+        if limit < np.inf:
+            velocities = states[:, self.model.nq :]
+            np.minimum(np.maximum(velocities, -limit, out=velocities), limit, out=velocities)
+        return states
 
     def reset(self, simulator: int, seed: int) -> None:
         """Start a new episode in one simulator, as ``gymnasium.make(...).reset(seed=seed)`` would."""
@@ -123,7 +127,8 @@ class MujocoBatch:
     def _outcome(self, x_before: NDArray[np.float64], actions: NDArray[np.floating]) -> StepOutcome:
         # The order of the operations follows Gymnasium's, so that the bits do too.
         env = self.env
-        healthy = env.batch_healthy(self._qpos, self._qvel)
+        inside = (self._healthy_above < self._states) & (self._states < self._healthy_below)
+        healthy = np.asarray(inside.all(axis=1))
         rewards = env._forward_reward_weight * ((self._qpos[:, 0] - x_before) / env.dt)
         rewards = rewards + healthy * env._healthy_reward
         rewards = rewards - env._ctrl_cost_weight * np.square(actions).sum(axis=1)

@@ -33,8 +33,8 @@ class BatchedTask(Protocol):
     def dt(self) -> float:
         """Seconds per control step."""
 
-    def batch_healthy(self, qpos: Floats, qvel: Floats) -> NDArray[np.bool_]:
-        """Return (G,) health of (G, nq) positions and (G, nv) velocities."""
+    def healthy_bounds(self) -> tuple[Floats, Floats]:
+        """Return two (nq + nv,) vectors: a healthy state ``[qpos, qvel]`` lies strictly between them."""
 
     def reset_velocity(self, rng: np.random.Generator) -> Floats:
         """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
@@ -43,6 +43,17 @@ class BatchedTask(Protocol):
 def _uniform_velocity(task: "HopperEnv | Walker2dEnv", rng: np.random.Generator) -> Floats:
     scale = task._reset_noise_scale
     return task.init_qvel + rng.uniform(low=-scale, high=scale, size=task.model.nv)
+
+
+def _no_bounds(task: BatchedTask) -> tuple[Floats, Floats]:
+    size = task.model.nq + task.model.nv
+    return np.full(size, -np.inf), np.full(size, np.inf)
+
+
+def _height_and_angle_bounds(task: "HopperEnv | Walker2dEnv") -> tuple[Floats, Floats]:
+    low, high = _no_bounds(task)
+    (low[1], high[1]), (low[2], high[2]) = task._healthy_z_range, task._healthy_angle_range
+    return low, high
 
 
 class HopperEnv(hopper_v5.HopperEnv):
@@ -56,18 +67,15 @@ class HopperEnv(hopper_v5.HopperEnv):
         super().__init__(exclude_current_positions_from_observation=False, **kwargs)
         self.model.opt.gravity[2] = -gravity
 
-    def batch_healthy(self, qpos: Floats, qvel: Floats) -> NDArray[np.bool_]:
-        """Return (G,) health for states ``qpos`` (G, 6) and ``qvel`` (G, 6), by the rule of Hopper-v5."""
-        low, high = self._healthy_state_range
-        z, angle = qpos[:, 1], qpos[:, 2]
-        inside = ((low < qpos[:, 2:]) & (qpos[:, 2:] < high)).all(1) & ((low < qvel) & (qvel < high)).all(1)
-        return (
-            inside
-            & (self._healthy_z_range[0] < z)
-            & (z < self._healthy_z_range[1])
-            & (self._healthy_angle_range[0] < angle)
-            & (angle < self._healthy_angle_range[1])
-        )
+    def healthy_bounds(self) -> tuple[Floats, Floats]:
+        """Return the bounds of a healthy state (12,), by the rule of Hopper-v5."""
+        low, high = _height_and_angle_bounds(self)
+        # Everything but root x and height; the angle has two ranges.
+        for bounds, limit, narrower in zip(
+            (low, high), self._healthy_state_range, (np.maximum, np.minimum), strict=True
+        ):
+            bounds[2:] = narrower(bounds[2:], limit)
+        return low, high
 
     def reset_velocity(self, rng: np.random.Generator) -> Floats:
         """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
@@ -89,15 +97,9 @@ class Walker2dEnv(walker2d_v5.Walker2dEnv):
         for foot in ("foot_geom", "foot_left_geom"):
             self.model.geom(foot).friction[0] = friction
 
-    def batch_healthy(self, qpos: Floats, qvel: Floats) -> NDArray[np.bool_]:
-        """Return (G,) health for states ``qpos`` (G, 9) and ``qvel`` (G, 9), by the rule of Walker2d-v5."""
-        z, angle = qpos[:, 1], qpos[:, 2]
-        return (
-            (self._healthy_z_range[0] < z)
-            & (z < self._healthy_z_range[1])
-            & (self._healthy_angle_range[0] < angle)
-            & (angle < self._healthy_angle_range[1])
-        )
+    def healthy_bounds(self) -> tuple[Floats, Floats]:
+        """Return the bounds of a healthy state (18,), by the rule of Walker2d-v5."""
+        return _height_and_angle_bounds(self)
 
     def reset_velocity(self, rng: np.random.Generator) -> Floats:
         """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
@@ -122,9 +124,9 @@ class HalfCheetahEnv(half_cheetah_v5.HalfCheetahEnv):
             name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator)
             self.model.actuator_gear[actuator, 0] *= front if name.startswith("f") else back
 
-    def batch_healthy(self, qpos: Floats, qvel: Floats) -> NDArray[np.bool_]:
+    def healthy_bounds(self) -> tuple[Floats, Floats]:
         """HalfCheetah is never unhealthy, and pays nothing for it."""
-        return np.ones(len(qpos), np.bool_)
+        return _no_bounds(self)
 
     def reset_velocity(self, rng: np.random.Generator) -> Floats:
         """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
