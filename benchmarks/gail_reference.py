@@ -38,7 +38,6 @@ from pipeline.versions import library_versions  # noqa: E402
 ENV_ID = "oodil/Hopper-v0"
 EXPERT = Path(__file__).parents[1] / "configs" / "experts" / "hopper-gravity-9.8"
 IMITATOR, DEMONSTRATOR = {"gravity": 12.0}, {"gravity": 9.8}
-HORIZON = 1000
 TARGET_RETURN = 2900.0
 EVALUATION_INTERVAL = 50_000
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -75,7 +74,7 @@ def run_seed(seed: int, config: GailConfig) -> dict[str, Any]:
     demonstrations, _ = collect_demonstrations(
         policy, source, "9.8", 10, seed, deterministic=False, full_length_only=True, context=Quiet()
     )
-    reward = AdversarialReward(demonstrations, np.ones(len(demonstrations)), HORIZON, config.discriminator, seed)
+    reward = AdversarialReward(demonstrations, np.ones(len(demonstrations)), config.discriminator, seed)
     learner = Learner(demonstrations.observation_dim, 3, config, reward, seed)
     seconds: list[float] = []
     evaluating = 0.0

@@ -32,19 +32,12 @@ def imitation_reward(logits_expert_is_high: Tensor) -> Tensor:
 
 
 class Discriminator(nn.Module):
-    """A network on pairs (s, s') and its optimiser.
+    """A network on pairs (s, s') and its optimiser."""
 
-    With ``sees_ends`` a pair has one more entry, 0 for transitions and 1 for the state after a failure, whose other
-    entries are 0: an absorbing state (Kostrikov et al. 2019, https://arxiv.org/abs/1809.02925).
-    """
-
-    def __init__(
-        self, observation_dim: int, sees_ends: bool, config: DiscriminatorConfig, rng: torch.Generator
-    ) -> None:
+    def __init__(self, observation_dim: int, config: DiscriminatorConfig, rng: torch.Generator) -> None:
         super().__init__()
         self.config = config
-        self.sees_ends = sees_ends
-        self.net = MLP(2 * observation_dim + sees_ends, config.hidden, 1, rng)
+        self.net = MLP(2 * observation_dim, config.hidden, 1, rng)
         self.optimiser = Adam(list(self.parameters()), config.learning_rate)
 
     def forward(self, pairs: Tensor) -> Tensor:
@@ -52,15 +45,8 @@ class Discriminator(nn.Module):
         return self.net(pairs).squeeze(-1)
 
     def pairs(self, states: NDArray[np.float32], successors: NDArray[np.float32]) -> Tensor:
-        """Return (B, 2S), or (B, 2S + 1) with ``sees_ends``, from (B, S) states and their successors."""
-        flag = [np.zeros((len(states), 1), np.float32)] if self.sees_ends else []
-        return torch.from_numpy(np.concatenate((states, successors, *flag), axis=1))
-
-    def absorbing_pair(self) -> Tensor:
-        """Return (2S + 1,): what follows a failure, for ever."""
-        pair = torch.zeros(self.net.layers[0].in_features)
-        pair[-1] = 1
-        return pair
+        """Return (B, 2S) from (B, S) states and their successors."""
+        return torch.from_numpy(np.concatenate((states, successors), axis=1))
 
     def update(self, demonstration_pairs: Tensor, policy_pairs: Tensor) -> dict[str, float]:
         """Take one full-batch step on (M, 2S) demonstration pairs against (B, 2S) policy pairs."""
@@ -77,24 +63,10 @@ class Discriminator(nn.Module):
 
 
 @torch.no_grad()
-def mean_logit_per_demonstration(
-    discriminator: Discriminator, demonstrations: Demonstrations, horizon: int
-) -> NDArray[np.float64]:
-    """Return (N,) logits averaged over each demonstration, for Eqn (6).
-
-    One that ended in failure goes on in the absorbing state until the horizon, in steps.
-    """
+def mean_logit_per_demonstration(discriminator: Discriminator, demonstrations: Demonstrations) -> NDArray[np.float64]:
+    """Return (N,) logits averaged over each demonstration, for Eqn (6)."""
     starts = demonstrations.transition_starts()
     states = demonstrations.observations
     logits = discriminator(discriminator.pairs(states[starts], states[starts + 1])).double().numpy()
     counts = demonstrations.lengths - 1
-    sums = np.add.reduceat(logits, offsets_of(counts)[:-1])
-    if discriminator.sees_ends:
-        after = absorbed_steps(demonstrations, horizon)
-        sums, counts = sums + after * float(discriminator(discriminator.absorbing_pair())), counts + after
-    return np.asarray(sums / counts)
-
-
-def absorbed_steps(demonstrations: Demonstrations, horizon: int) -> NDArray[np.int64]:
-    """Return (N,) steps between a failure and the horizon; 0 for demonstrations that did not fail."""
-    return np.where(demonstrations.terminated, np.maximum(0, horizon - (demonstrations.lengths - 1)), 0)
+    return np.asarray(np.add.reduceat(logits, offsets_of(counts)[:-1]) / counts)

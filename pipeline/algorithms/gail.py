@@ -13,7 +13,6 @@ from torch import Tensor
 
 from pipeline.algorithms.discriminator import (
     Discriminator,
-    absorbed_steps,
     imitation_reward,
     mean_logit_per_demonstration,
 )
@@ -31,14 +30,10 @@ class AdversarialReward:
         self,
         demonstrations: Demonstrations,
         weights: NDArray[np.float64],
-        horizon: int,
         config: DiscriminatorConfig,
         root_seed: int,
     ) -> None:
         """Prepare to draw pairs in proportion to ``weights`` (N,), one per demonstration (Eqn 7).
-
-        Where some demonstrations ended in failure, the discriminator also compares how much of an episode of
-        ``horizon`` steps is left after one. It is not part of the reward: nobody is paid for falling.
 
         Raises ValueError unless the weights are finite, not negative and not all zero.
         """
@@ -48,16 +43,11 @@ class AdversarialReward:
             raise ValueError("all weights are zero: there is nothing to imitate")
         self.root_seed = root_seed
         self._starts = demonstrations.transition_starts()
-        self._horizon = horizon
-        after_end = absorbed_steps(demonstrations, horizon)
-        mass = np.repeat(weights, demonstrations.lengths - 1)
-        if after_end.any():
-            mass = np.append(mass, weights @ after_end)
-        self._cumulative = np.cumsum(mass)
+        self._cumulative = np.cumsum(np.repeat(weights, demonstrations.lengths - 1))
         self._state_weights = np.repeat(weights, demonstrations.lengths)
         self._observations = demonstrations.observations
         rng = torch.Generator().manual_seed(torch_seed(derive_key(root_seed, "discriminator", "initial")))
-        self.discriminator = Discriminator(demonstrations.observation_dim, bool(after_end.any()), config, rng)
+        self.discriminator = Discriminator(demonstrations.observation_dim, config, rng)
 
     def state_moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return mean and standard deviation (S,) of the demonstrations' states as they are weighted."""
@@ -78,11 +68,6 @@ class AdversarialReward:
         self.discriminator.optimiser.learning_rate = config.learning_rate * step_scale
         policy_pairs = self._policy_pairs(rollouts)
         rng = generator(derive_key(self.root_seed, "discriminator", iteration))
-        if self.discriminator.sees_ends:
-            # An episode of the policy is followed by as many absorbed steps as it falls short of the horizon.
-            after_end = sum(int((self._horizon - r.episode_lengths).sum()) for r in rollouts)
-            absorbed = rng.random(len(policy_pairs)) * (len(policy_pairs) + after_end) < after_end
-            policy_pairs[torch.from_numpy(absorbed)] = self.discriminator.absorbing_pair()
         count = min(len(self._starts), len(policy_pairs))
         metrics: dict[str, float] = {}
         for _ in range(config.steps_per_iteration):
@@ -94,14 +79,11 @@ class AdversarialReward:
         points = rng.random(count) * self._cumulative[-1]
         chosen = np.searchsorted(self._cumulative, points, side="right")
         starts = self._starts[np.minimum(chosen, len(self._starts) - 1)]
-        pairs = self.discriminator.pairs(self._observations[starts], self._observations[starts + 1])
-        if self.discriminator.sees_ends:
-            pairs[torch.from_numpy(chosen >= len(self._starts))] = self.discriminator.absorbing_pair()
-        return pairs
+        return self.discriminator.pairs(self._observations[starts], self._observations[starts + 1])
 
     def mean_logits(self, demonstrations: Demonstrations) -> NDArray[np.float64]:
         """Return (N,) mean logits of demonstrations by the discriminator as it stands."""
-        return mean_logit_per_demonstration(self.discriminator, demonstrations, self._horizon)
+        return mean_logit_per_demonstration(self.discriminator, demonstrations)
 
     def state(self) -> dict[str, Tensor]:
         """Return the discriminator and its optimiser."""

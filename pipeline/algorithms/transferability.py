@@ -31,6 +31,16 @@ def transferability(mean_logits: Array) -> Array:
     return np.exp(-np.logaddexp(0, mean_logits))
 
 
+def share_lasted(demonstrations: Demonstrations, horizon: int) -> Array:
+    """Return (N,) the part of ``horizon`` steps that each demonstration covers; 1 unless it ended in failure.
+
+    After a failure there is nothing left to reproduce. Over the whole horizon, as the others are judged, a
+    demonstration that fell after a tenth of it is worth a tenth, however well the tenth can be imitated.
+    """
+    lasted = np.minimum(1.0, (demonstrations.lengths - 1) / horizon)
+    return np.where(demonstrations.terminated, lasted, 1.0)
+
+
 def sharpened_weights(scores: Array, sharpening: float) -> Array:
     """Return (N,) weights that sum to one, proportional to score ** sharpening; uniform when every score is zero."""
     largest = scores.max()

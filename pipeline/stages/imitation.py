@@ -43,8 +43,8 @@ class ImitationStage(Stage):
         demonstrations = load_demonstrations(run)
         seed = torch_seed(derive_key(config.seed, "imitation"))
         simulators = make_batch(environment.id, environment.dynamics, 1)
-        weights, horizon = self.weights(run, demonstrations), simulators.max_episode_steps
-        reward = AdversarialReward(demonstrations, weights, horizon, gail.discriminator, seed)
+        weights = self.weights(run, demonstrations)
+        reward = AdversarialReward(demonstrations, weights, gail.discriminator, seed)
         learner = Learner(simulators.observation_dim, simulators.action_dim, gail, reward, seed)
 
         def curve_point() -> NDArray[np.float64]:

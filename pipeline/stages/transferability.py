@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.algorithms.transferability import (
     most_convinced,
     sampling_mass,
+    share_lasted,
     sharpened_weights,
     transferability,
 )
@@ -60,8 +61,7 @@ class TransferabilityStage(Stage):
         demonstrations = load_demonstrations(run).select(members)
         seed = torch_seed(derive_key(config.seed, self.name, job))
         simulators = make_batch(config.environment.id, config.environment.dynamics, 1)
-        weights, horizon = np.ones(len(members)), simulators.max_episode_steps
-        reward = AdversarialReward(demonstrations, weights, horizon, section.gail.discriminator, seed)
+        reward = AdversarialReward(demonstrations, np.ones(len(members)), section.gail.discriminator, seed)
         learner = Learner(simulators.observation_dim, simulators.action_dim, section.gail, reward, seed)
         probe = Probe("logits", section.num_scores, lambda: reward.mean_logits(demonstrations))
         history = train(learner, config.environment, section.gail, [probe], context, self.checkpoints(run, job))
@@ -91,7 +91,8 @@ class TransferabilityStage(Stage):
             history[f"{cluster}/env_steps"] = arrays["env_steps"]
             history[f"{cluster}/scores"] = transferability(arrays["logits"])
             history[f"{cluster}/demonstrations"] = arrays["demonstrations"]
-        scores = transferability(logits)
+        horizon = make_batch(config.environment.id, config.environment.dynamics, 1).max_episode_steps
+        scores = transferability(logits) * share_lasted(demonstrations, horizon)
         sharpening = config.transferability.sharpening
         weights = sharpened_weights(scores, sharpening)
         arrays = {"scores": scores, "weights": weights, "clusters": _labels(run)}

@@ -1,12 +1,13 @@
-"""A control of the transferability itself, with real training: the imitator's own dynamics come out as transferable.
+"""Two controls of the transferability itself, with real training in the imitator's own dynamics: an expert comes out as
+transferable there, and a robot that does nothing and falls does not."""
 
-Its counterpart, a policy that does nothing, is not held: docs/results.md has the figures and the reason.
-"""
-
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from pipeline.algorithms.transferability import sampling_mass
 from pipeline.artifacts import RunDirectory, encode_arrays, write_artifact
 from pipeline.data import Demonstrations
 from pipeline.datasets import encode_demonstrations
@@ -26,11 +27,20 @@ OWN = {"gravity": 9.8}
 COUNT = 10
 
 
-def test_own_dynamics_are_transferable(tmp_path: Path) -> None:
+def test_an_expert_is_transferable_and_doing_nothing_is_not(tmp_path: Path) -> None:
     expert, _ = load_expert(ROOT / "configs" / "experts" / "hopper-gravity-9.8")
-    simulators = make_batch("oodil/Hopper-v0", OWN, COUNT)
-    episodes = run_episodes(simulators, expert, generator((0,)), stochastic=False)
-    demonstrations = Demonstrations.of(episodes, "own dynamics")
+    idle = replace(
+        expert,
+        weights=tuple(np.zeros_like(w) for w in expert.weights),
+        biases=tuple(np.zeros_like(b) for b in expert.biases),
+    )
+    parts = []
+    for policy, label in ((expert, "expert"), (idle, "does nothing")):
+        simulators = make_batch("oodil/Hopper-v0", OWN, COUNT)
+        parts.append(Demonstrations.of(run_episodes(simulators, policy, generator((0,)), stochastic=False), label))
+    demonstrations = Demonstrations.joined(parts)
+    does_nothing = demonstrations.sources == 1
+    assert demonstrations.terminated[does_nothing].all() and not demonstrations.terminated[~does_nothing].any()
     file = tmp_path / "demonstrations.safetensors"
     file.write_bytes(encode_demonstrations(demonstrations, "oodil/Hopper-v0"))
     values = {
@@ -49,8 +59,11 @@ def test_own_dynamics_are_transferable(tmp_path: Path) -> None:
     write_artifact(run.directory.stage("clustering"), {}, {"assignment.safetensors": labels})
 
     stage = TransferabilityStage()
-    outcome = LocalEngine(1).run_jobs(stage, run, stage.jobs(run), lambda _: None, lambda: False)
+    outcome = LocalEngine(2).run_jobs(stage, run, stage.jobs(run), lambda _: None, lambda: False)
     assert not outcome.failed, outcome.failed
     write_artifact(run.directory.stage(stage.name), {}, stage.combine(run))
-    scores = run.artifact(stage.name).arrays("transferability.safetensors")["scores"]
-    assert scores.min() > 0.1, scores
+    arrays = run.artifact(stage.name).arrays("transferability.safetensors")
+    scores = arrays["scores"]
+    assert scores[~does_nothing].min() > 0.1, scores
+    assert scores[does_nothing].max() < scores[~does_nothing].min() / 2, scores
+    assert sampling_mass(arrays["weights"], demonstrations)[does_nothing].sum() < 0.05, scores

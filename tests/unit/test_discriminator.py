@@ -17,7 +17,7 @@ def pairs():
 
 
 def build(**settings):
-    return Discriminator(3, False, DiscriminatorConfig(**settings), torch.Generator().manual_seed(1))
+    return Discriminator(3, DiscriminatorConfig(**settings), torch.Generator().manual_seed(1))
 
 
 def test_loss_by_hand():

@@ -11,12 +11,10 @@ from pipeline.algorithms.discriminator import imitation_reward
 from pipeline.algorithms.gail import AdversarialReward
 from pipeline.config import DiscriminatorConfig
 
-HORIZON = 100
-
 
 def build(demonstrations, weights, **settings):
     return AdversarialReward(
-        demonstrations, np.array(weights, np.float64), HORIZON, DiscriminatorConfig(**settings), root_seed=0
+        demonstrations, np.array(weights, np.float64), DiscriminatorConfig(**settings), root_seed=0
     )
 
 
@@ -136,7 +134,7 @@ def test_an_artificial_reward_of_the_environment_changes_nothing(demonstrations,
 def test_state_restores_another_instance(demonstrations, rollout, assert_same_bits):
     one = build(demonstrations(20), [1.0])
     one.update([rollout(0)], 0, 1.0)
-    two = AdversarialReward(demonstrations(20), np.ones(1), HORIZON, DiscriminatorConfig(), root_seed=0)
+    two = AdversarialReward(demonstrations(20), np.ones(1), DiscriminatorConfig(), root_seed=0)
     two.load_state({name: value.clone() for name, value in one.state().items()})
     for iteration in (1, 2):
         one.update([rollout(iteration)], iteration, 1.0)
@@ -165,52 +163,3 @@ def test_step_scale_multiplies_the_step_size(demonstrations, rollout):
 
     assert moved(1.0) == pytest.approx(1e-2, rel=1e-2)
     assert moved(0.25) == pytest.approx(0.25e-2, rel=1e-2)
-
-
-def with_failures(demonstrations, *lengths, failed):
-    made = demonstrations(*lengths)
-    return replace(made, terminated=np.array(failed))
-
-
-def test_what_follows_a_failure_is_drawn_in_proportion_to_the_rest_of_the_horizon(demonstrations):
-    """Of 100 steps, the first shows 4 transitions and 96 absorbed steps, the second 20 transitions and no failure."""
-    reward = build(with_failures(demonstrations, 5, 21, failed=[True, False]), [2.0, 1.0])
-    pairs = reward.draw(50_000, np.random.default_rng(0)).numpy()
-    absorbed = pairs[:, -1] == 1
-    assert pairs.shape[1] == 7 and (pairs[absorbed, :-1] == 0).all()
-    assert absorbed.mean() == pytest.approx(2 * 96 / (2 * 100 + 20), abs=0.01)
-    chosen, _ = drawn_numbers(torch.from_numpy(pairs[~absorbed, :-1]))
-    assert (chosen == 0).mean() == pytest.approx(2 * 4 / (2 * 4 + 20), abs=0.01)
-
-
-def test_an_imitator_that_does_not_fail_is_told_from_demonstrations_that_do(demonstrations, rollout):
-    shown = with_failures(demonstrations, 11, 11, failed=[True, True])
-    reward = build(shown, [1.0, 1.0], learning_rate=1e-2)
-    standing = replace(rollout(0, num_steps=20), episode_lengths=np.array([HORIZON]), episode_returns=np.array([1.0]))
-    for iteration in range(60):
-        reward.update([standing], iteration, 1.0)
-    assert reward.mean_logits(shown).min() > 2
-    falling = replace(standing, episode_lengths=np.full(20, 10), episode_returns=np.zeros(20))
-    for iteration in range(60, 160):
-        reward.update([falling], iteration, 1.0)
-    assert abs(reward.mean_logits(shown)).max() < 1
-
-
-def test_mean_logits_go_on_to_the_horizon_where_a_demonstration_failed(demonstrations):
-    shown = with_failures(demonstrations, 5, 4, failed=[True, False])
-    reward = build(shown, [1.0, 1.0])
-    with torch.no_grad():
-        for parameter in reward.discriminator.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=torch.Generator().manual_seed(2)))
-        logits = []
-        for n in range(2):
-            states = shown[n]
-            logits.append(reward.discriminator(reward.discriminator.pairs(states[:-1], states[1:])).double().sum())
-        after = reward.discriminator(reward.discriminator.absorbing_pair())
-    expected = [(logits[0] + 96 * after) / 100, logits[1] / 3]
-    np.testing.assert_allclose(reward.mean_logits(shown), expected, rtol=1e-5)
-
-
-def test_without_failures_nothing_is_added(demonstrations):
-    assert build(demonstrations(5), [1.0]).draw(4, np.random.default_rng(0)).shape == (4, 6)
-    assert not build(with_failures(demonstrations, HORIZON + 1, failed=[True]), [1.0]).discriminator.sees_ends

@@ -1,5 +1,7 @@
 """From logits to scores to weights, by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,7 @@ from pipeline.algorithms.discriminator import Discriminator, mean_logit_per_demo
 from pipeline.algorithms.transferability import (
     most_convinced,
     sampling_mass,
+    share_lasted,
     sharpened_weights,
     transferability,
 )
@@ -16,7 +19,7 @@ from pipeline.config import DiscriminatorConfig
 
 def test_mean_logit_is_over_the_transitions_of_each_demonstration(demonstrations):
     made = demonstrations(4, 2, 3)
-    discriminator = Discriminator(3, False, DiscriminatorConfig(hidden=(8,)), torch.Generator().manual_seed(0))
+    discriminator = Discriminator(3, DiscriminatorConfig(hidden=(8,)), torch.Generator().manual_seed(0))
     with torch.no_grad():
         for p in discriminator.parameters():
             p.copy_(torch.randn(p.shape, generator=torch.Generator().manual_seed(1)))
@@ -24,7 +27,7 @@ def test_mean_logit_is_over_the_transitions_of_each_demonstration(demonstrations
         for n in range(3):
             states = torch.from_numpy(made[n])
             expected.append(float(discriminator(torch.cat((states[:-1], states[1:]), dim=1)).mean()))
-    np.testing.assert_allclose(mean_logit_per_demonstration(discriminator, made, 9), expected, rtol=1e-5)
+    np.testing.assert_allclose(mean_logit_per_demonstration(discriminator, made), expected, rtol=1e-5)
 
 
 def test_the_most_convinced_of_the_last_third_decides():
@@ -37,6 +40,12 @@ def test_the_most_convinced_of_the_last_third_decides():
 
 def test_transferability_is_half_where_nothing_can_be_told_and_falls_with_the_logit():
     np.testing.assert_allclose(transferability(np.array([0.0, np.log(3.0), -np.log(3.0)])), [0.5, 0.25, 0.75])
+
+
+def test_a_failure_counts_for_the_part_of_the_horizon_that_it_lasted(demonstrations):
+    """Of 20 steps: 5 and then a fall, 5 of a recording that goes no further, all 20 and then a fall, and beyond."""
+    made = replace(demonstrations(6, 6, 21, 31), terminated=np.array([True, False, True, True]))
+    np.testing.assert_allclose(share_lasted(made, 20), [0.25, 1, 1, 1])
 
 
 def test_weights_are_powers_of_the_scores():
