@@ -9,13 +9,15 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 if TYPE_CHECKING:
+    from pipeline.config import RunConfig
     from pipeline.stage import Run, Stage
     from workers.channels import Access
+    from workers.engine import Engine
 
 # Before NumPy and torch are loaded: one compute thread per process, so that the bits do not depend on the machine.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -43,6 +45,8 @@ Until = Annotated[str | None, typer.Option(help="Stop after this stage.")]
 Force = Annotated[str | None, typer.Option(help="Compute this stage again although it is finished.")]
 Bind = Annotated[str | None, typer.Option(help="Let workers of other machines join here, e.g. tcp://0.0.0.0:5555.")]
 Keys = Annotated[Path | None, typer.Option(help="Folder of keys, made by `oodil keys new`; --bind needs it.")]
+EngineName = Annotated[Literal["local", "ray"], typer.Option(help="This machine's processes, or a Ray cluster.")]
+TrustCluster = Annotated[bool, typer.Option("--trust-cluster", help="Use a Ray cluster that asks for no token.")]
 
 
 @app.command()
@@ -55,18 +59,20 @@ def run(
     force: Force = None,
     bind: Bind = None,
     keys: Keys = None,
+    engine: EngineName = "local",
+    trust_cluster: TrustCluster = False,
 ) -> None:
     """Run the pipeline; what is already finished is reused, what was interrupted goes on."""
     with _bad_input():
-        access = _access(bind, keys, workers)
         from pipeline.loading import load_config
 
         config = load_config(config_path, overrides)
         from walk import check_inputs, open_run
 
         check_inputs(config)
+        chosen = _engine(config, engine, workers, bind, keys, trust_cluster)
         opened = open_run(run_dir or Path("runs") / f"{config.name}-seed{config.seed}", config)
-    _execute(opened, workers, until, force, access)
+    _execute(opened, chosen, until, force)
 
 
 @app.command()
@@ -77,15 +83,17 @@ def resume(
     force: Force = None,
     bind: Bind = None,
     keys: Keys = None,
+    engine: EngineName = "local",
+    trust_cluster: TrustCluster = False,
 ) -> None:
-    """Go on with an interrupted run, with any number of workers."""
+    """Go on with an interrupted run, with any number of workers or on another engine."""
     from walk import check_inputs, read_run
 
     with _bad_input():
-        access = _access(bind, keys, workers)
         opened = read_run(run_dir)
         check_inputs(opened.config)
-    _execute(opened, workers, until, force, access)
+        chosen = _engine(opened.config, engine, workers, bind, keys, trust_cluster)
+    _execute(opened, chosen, until, force)
 
 
 @app.command()
@@ -239,12 +247,13 @@ def collect_demos(
         config = load_config(config_path, overrides)
         if not train:
             check_inputs(config)
+        engine = _engine(config, "local", workers)
         opened = open_run(output.with_name(f".{output.name}.run"), config)
     if train:
         experts = ExpertsStage()
-        _walk(opened, [experts], workers, None)
+        _walk(opened, [experts], engine, None)
         print("\n".join(experts.export(opened)))
-    _walk(opened, stages(config)[:1], workers, None)
+    _walk(opened, stages(config)[:1], engine, None)
     output.write_bytes(opened.artifact("demonstrations").read("demonstrations.safetensors"))
     inspect_demos(output)
 
@@ -299,6 +308,32 @@ def export_demos(
         print(export(load_demonstrations(opened), found, target))
 
 
+def _engine(
+    config: "RunConfig",
+    name: str,
+    workers: int | None,
+    bind: str | None = None,
+    keys: Path | None = None,
+    trust_cluster: bool = False,
+) -> "Engine":
+    """Return where jobs run; refuse options that belong to another engine."""
+    if name == "local":
+        from workers.engine import LocalEngine
+
+        if trust_cluster:
+            raise ValueError("--trust-cluster belongs to --engine ray")
+        access = _access(bind, keys, workers)
+        return LocalEngine(config.runtime.workers if workers is None else workers, access=access)
+    if (workers, bind, keys) != (None, None, None):
+        raise ValueError("--workers, --bind and --keys belong to --engine local; a Ray cluster has its own workers")
+    try:
+        from workers.cluster import RayEngine, connect
+    except ImportError as error:
+        raise ValueError(f"--engine ray needs Ray (pip install 'oodil[ray]'): {error}") from None
+    connect(trust_cluster)
+    return RayEngine()
+
+
 def _access(bind: str | None, keys: Path | None, workers: int | None) -> "Access | None":
     """Return where other machines may join; refuse to listen without keys, or where it cannot be done."""
     if bind is None and keys is None:
@@ -314,9 +349,7 @@ def _access(bind: str | None, keys: Path | None, workers: int | None) -> "Access
     return access
 
 
-def _execute(
-    opened: "Run", workers: int | None, until: str | None, force: str | None, access: "Access | None" = None
-) -> None:
+def _execute(opened: "Run", engine: "Engine", until: str | None, force: str | None) -> None:
     """Walk the stages, then write the report and print the summary."""
     from pipeline.report import write_report
     from pipeline.results import summary
@@ -330,20 +363,18 @@ def _execute(
             if name is not None and name not in names:
                 raise ValueError(f"no stage {name!r}; this run has {', '.join(names)}")
     try:
-        _walk(opened, chosen[: names.index(until or names[-1]) + 1], workers, force, access)
+        _walk(opened, chosen[: names.index(until or names[-1]) + 1], engine, force)
     finally:
         path = write_report(opened)
     print_summary(summary(opened), path)
 
 
-def _walk(
-    opened: "Run", chosen: list["Stage"], workers: int | None, force: str | None, access: "Access | None" = None
-) -> None:
+def _walk(opened: "Run", chosen: list["Stage"], engine: "Engine", force: str | None) -> None:
     from pipeline.loading import ConfigError
     from walk import UnfinishedError, walk
 
     try:
-        walk(opened, chosen, workers, force, access)
+        walk(opened, chosen, engine, force)
     except ConfigError as error:
         print(f"oodil: {error}", file=sys.stderr)
         raise typer.Exit(EXIT_BAD_INPUT) from None

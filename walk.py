@@ -29,8 +29,7 @@ from pipeline.stages import stages
 from pipeline.stages.demonstrations import check_demonstrations
 from pipeline.versions import library_versions
 from terminal import Display, stop_flag
-from workers.channels import Access
-from workers.engine import Engine, LocalEngine, Outcome
+from workers.engine import Engine, Outcome
 
 
 class UnfinishedError(Exception):
@@ -79,16 +78,12 @@ def check_inputs(config: RunConfig) -> None:
     check_demonstrations(config, simulators.observation_dim)
 
 
-def walk(
-    run: Run, chosen: list[Stage], workers: int | None, force: str | None = None, access: Access | None = None
-) -> None:
+def walk(run: Run, chosen: list[Stage], engine: Engine, force: str | None = None) -> None:
     """Bring every chosen stage to its finished artifact. Raises UnfinishedError where that ends early."""
-    workers = run.config.runtime.workers if workers is None else workers
-    engine = LocalEngine(workers, access=access)
     with _lock(run.directory), Display() as display, stop_flag(display.stopping) as should_stop:
-        _record(run.directory, "run_started", workers=workers, versions=library_versions())
+        _record(run.directory, "run_started", engine=str(engine), versions=library_versions())
         for stage in chosen:
-            _bring_up(stage, run, engine, workers, force == stage.name, display, should_stop)
+            _bring_up(stage, run, engine, force == stage.name, display, should_stop)
         _record(run.directory, "run_finished")
 
 
@@ -96,7 +91,6 @@ def _bring_up(
     stage: Stage,
     run: Run,
     engine: Engine,
-    workers: int,
     forced: bool,
     display: Display,
     should_stop: Callable[[], bool],
@@ -114,7 +108,7 @@ def _bring_up(
     elif resumed:
         reason = "resumed from checkpoint" + ("" if resumed == [stage.name] else f" ({', '.join(resumed)})")
     display.stage_started(stage.name, reason, len(pending))
-    _record(run.directory, "stage_started", stage=stage.name, reason=reason, workers=workers, jobs=len(pending))
+    _record(run.directory, "stage_started", stage=stage.name, reason=reason, jobs=len(pending))
     outcome = engine.run_jobs(stage, run, pending, display.event, should_stop)
     if outcome.stopped or outcome.failed:
         _record(run.directory, "stage_interrupted", stage=stage.name, seconds=time.monotonic() - started)
@@ -123,7 +117,7 @@ def _bring_up(
     if files is not None:
         write_artifact(path, origin, files, library_versions())
     seconds = time.monotonic() - started
-    _record(run.directory, "stage_finished", stage=stage.name, seconds=seconds, workers=workers)
+    _record(run.directory, "stage_finished", stage=stage.name, seconds=seconds)
     display.stage_finished(stage.name, seconds)
 
 

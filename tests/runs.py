@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,10 @@ PATIENCE_S = 120.0
 class LiveRun:
     """A run that goes on in the background, in a session of its own so that all of its processes can be found."""
 
-    def __init__(self, *arguments: str) -> None:
+    def __init__(self, *arguments: str, before: Sequence[str] = ()) -> None:
+        """Start ``oodil`` with these arguments; ``before`` are the words of a command that runs it."""
         self.process = subprocess.Popen(
-            [sys.executable, str(ROOT / "orchestrator.py"), *arguments],
+            [*before, sys.executable, str(ROOT / "orchestrator.py"), *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

@@ -125,6 +125,9 @@ class LocalEngine:
         self._stages = stages
         """Where a job's process finds ``(config, name) -> Stage``, as module:function."""
 
+    def __str__(self) -> str:
+        return f"local, {self._workers} workers"
+
     def run_jobs(
         self, stage: Stage, run: Run, jobs: list[str], on_event: OnEvent, should_stop: Callable[[], bool]
     ) -> Outcome:

@@ -60,22 +60,30 @@ def main(
 
     Returns DONE or STOPPED.
     """
+    from pipeline.stage import JobStoppedError
+
+    found, run = find(run_path, stages, stage)
+    runtime = run.config.runtime
+    access = Access(address, Path(keys)) if address else None
+    with _rollouts(link, endpoint, run_id, runtime.unit_timeout_s, access) as rollouts:
+        context = _Context(link, rollouts, runtime.checkpoint_interval_s)
+        try:
+            execute(found, run, job, context)
+        except JobStoppedError:
+            return STOPPED
+    return DONE
+
+
+def find(run_path: str, stages: str, name: str) -> "tuple[Stage, Run]":
+    """Return a stage of the run in a folder; ``stages`` is module:function for ``(config, name) -> Stage``."""
     from pipeline.artifacts import RunDirectory
     from pipeline.config import RunConfig
-    from pipeline.stage import JobStoppedError, Run
+    from pipeline.stage import Run
 
     directory = RunDirectory(Path(run_path))
     config = RunConfig.model_validate_json(directory.config.read_text())
     module, _, function = stages.partition(":")
-    found: Stage = getattr(importlib.import_module(module), function)(config, stage)
-    access = Access(address, Path(keys)) if address else None
-    with _rollouts(link, endpoint, run_id, config.runtime.unit_timeout_s, access) as rollouts:
-        context = _Context(link, rollouts, config.runtime.checkpoint_interval_s)
-        try:
-            execute(found, Run(config, directory), job, context)
-        except JobStoppedError:
-            return STOPPED
-    return DONE
+    return getattr(importlib.import_module(module), function)(config, name), Run(config, directory)
 
 
 def execute(stage: "Stage", run: "Run", job: str, context: "JobContext") -> None:

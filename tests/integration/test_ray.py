@@ -1,0 +1,128 @@
+"""The engine on a real Ray cluster of two nodes on this machine: the same bits as without, and one node may die."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import ray
+from ray.cluster_utils import Cluster
+
+from pipeline.artifacts import read_artifact
+from pipeline.loading import load_config
+from pipeline.rollout import InlineRollouts
+from pipeline.stages import stages
+from tests.fakes import STAGES, FakeStage, fake_run, hopper_units, lines, wait_until
+from tests.runs import MICRO
+from walk import open_run, walk
+from workers.cluster import RayEngine, RayRollouts, connect
+from workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, LocalEngine, Outcome
+
+pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
+    """A cluster of two nodes with one core each."""
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    made.add_node(num_cpus=1)
+    monkeypatch.setenv("RAY_ADDRESS", made.address)
+    try:
+        connect(trusted=False)
+        yield made
+    finally:
+        ray.shutdown()
+        made.shutdown()
+
+
+def test_jobs_go_on_after_whatever_happens_to_them(tmp_path: Path, cluster: Cluster) -> None:
+    """One raises in every attempt, one is killed once; neither ends the others, and the rest is as it is inline."""
+    inline, on_ray = fake_run(tmp_path / "inline"), fake_run(tmp_path / "ray", max_attempts=3)
+    LocalEngine(0, STAGES).run_jobs(FakeStage(False), inline, ["a"], lambda event: None, lambda: False)
+    events: list[Event] = []
+    outcome = RayEngine(STAGES).run_jobs(
+        FakeStage(False), on_ray, ["a", "raises", "killed"], events.append, lambda: False
+    )
+    assert outcome.done == ["a", "killed"] and outcome.failed.keys() == {"raises"} and not outcome.stopped
+    assert "ArithmeticError: told to, in attempt 1" in outcome.failed["raises"]
+    assert lines(on_ray.directory.path / "raises.began_at") == ["0", "2", "3"]
+    assert lines(on_ray.directory.path / "killed.began_at") == ["0", "3"]
+    failures = [(e.job, e.attempt, e.will_retry) for e in events if isinstance(e, JobFailed)]
+    assert [f for f in failures if f[0] == "raises"] == [("raises", 1, True), ("raises", 2, True), ("raises", 3, False)]
+    assert [f for f in failures if f[0] == "killed"] == [("killed", 1, True)]
+    assert events.count(JobStarted("killed", 2)) == events.count(JobDone("killed")) == 1
+    expected = inline.job_artifact("jobs", "a").sha256
+    assert {on_ray.job_artifact("jobs", job).sha256 for job in ("a", "killed")} == {expected}
+    assert read_artifact(on_ray.directory.job("jobs", "raises")) is None
+
+
+def test_a_learner_on_ray_stops_and_goes_on(tmp_path: Path, cluster: Cluster) -> None:
+    stage, whole, stopped = FakeStage(True), fake_run(tmp_path / "whole"), fake_run(tmp_path / "stopped")
+    LocalEngine(0, STAGES).run_jobs(stage, whole, ["a"], lambda event: None, lambda: False)
+    noted = stopped.directory.path / "waits.iterations"
+    engine = RayEngine(STAGES)
+    outcome = engine.run_jobs(stage, stopped, ["waits", "b"], lambda event: None, lambda: len(lines(noted)) >= 2)
+    assert outcome.stopped and "waits" in outcome.not_run and not outcome.failed
+    (stopped.directory.path / "go").touch()
+    assert engine.run_jobs(stage, stopped, ["waits"], lambda event: None, lambda: False) == Outcome(done=["waits"])
+    assert stopped.job_artifact("learner", "waits").sha256 == whole.job_artifact("learner", "a").sha256
+
+
+def test_units_give_the_same_bits_on_ray(cluster: Cluster, assert_same_bits) -> None:
+    sources = InlineRollouts(), RayRollouts()
+    for source in sources:
+        source.submit(hopper_units(3))
+    assert_same_bits(*[source.gather() for source in sources])
+
+
+def test_a_unit_that_raises_says_why(cluster: Cluster) -> None:
+    source = RayRollouts()
+    source.submit(hopper_units(0, count=1, env_id="oodil/Nowhere-v0"))
+    with pytest.raises(ValueError, match="oodil/Nowhere-v0"):
+        source.gather()
+
+
+def test_a_node_dies_in_the_middle_of_a_run(tmp_path: Path, cluster: Cluster) -> None:
+    """The whole pipeline, with the second node killed while the cluster jobs run: the same artifacts as inline."""
+    config = load_config(MICRO, [])
+    runs = {name: open_run(tmp_path / name, config) for name in ("inline", "ray")}
+    walk(runs["inline"], stages(config), LocalEngine(0))
+    second = cluster.worker_nodes
+    checkpoints = runs["ray"].directory.path / "checkpoints" / "transferability"
+
+    def kill() -> None:
+        wait_until(lambda: any(checkpoints.glob("*/*")), timeout_s=120)
+        cluster.remove_node(next(iter(second)), allow_graceful=False)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    walk(runs["ray"], stages(config), RayEngine())
+    killer.join()
+    assert len([node for node in ray.nodes() if node["Alive"]]) == 1
+    hashes = [[run.artifact(stage.name).sha256 for stage in stages(config)] for run in runs.values()]
+    assert hashes[0] == hashes[1]
+
+
+def test_a_cluster_of_several_machines_must_ask_for_a_token(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A third node at another address makes it one of several machines."""
+    ray.shutdown()
+    cluster.add_node(num_cpus=1, node_ip_address="127.0.0.2")
+    with pytest.raises(ValueError, match="RAY_AUTH_MODE=token"):
+        connect(trusted=False)
+    assert not ray.is_initialized()
+    connect(trusted=True)
+    ray.shutdown()
+    monkeypatch.setenv("RAY_ADDRESS", "ray.lab.example:6379")
+    with pytest.raises(ValueError, match="RAY_AUTH_MODE=token"):
+        connect(trusted=False)
+
+
+def test_a_folder_that_a_node_does_not_see_is_refused(tmp_path: Path, cluster: Cluster) -> None:
+    run = fake_run(tmp_path / "gone")
+    events: list[Event] = []
+    for path in sorted(run.directory.path.rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    run.directory.path.rmdir()
+    with pytest.raises(ValueError, match=r"does not see .*gone"):
+        RayEngine(STAGES).run_jobs(FakeStage(False), run, ["a"], events.append, lambda: False)
+    assert not [event for event in events if isinstance(event, JobProgress)]
