@@ -96,8 +96,9 @@ def train(
     probes: list[Probe],
     context: JobContext,
     checkpoints: Checkpoints,
+    is_over: Callable[[History], bool] = lambda history: False,
 ) -> History:
-    """Train until the budget is spent, from the newest checkpoint if there is one.
+    """Train until the budget is spent or ``is_over`` of what was measured, from the newest checkpoint if there is one.
 
     Raises JobStoppedError, after writing a checkpoint, when the context asks for a stop.
     """
@@ -105,8 +106,13 @@ def train(
     position = _resume(learner, config, context, checkpoints)
     last_checkpoint = time.monotonic()
     returns, lengths = _Recent(), _Recent()
-    if position.iteration < config.num_iterations:
-        context.rollouts.submit(_units(position, learner.root_seed, environment, config))
+
+    def has_ended() -> bool:
+        return position.iteration == config.num_iterations or is_over(position.history)
+
+    if has_ended():
+        return position.history
+    context.rollouts.submit(_units(position, learner.root_seed, environment, config))
     for iteration in range(position.iteration, config.num_iterations):
         results = context.rollouts.gather()
         rollouts = [result.rollout for result in results]
@@ -138,7 +144,9 @@ def train(
         if stop or time.monotonic() - last_checkpoint >= context.checkpoint_interval_s:
             _save(learner, position, checkpoints)
             last_checkpoint = time.monotonic()
-        if stop and position.iteration < config.num_iterations:
+        if has_ended():
+            break
+        if stop:
             raise JobStoppedError(f"stopped after {env_steps} environment steps")
     return position.history
 

@@ -97,7 +97,10 @@ class ReplayBatch:
         space = self._actions
         clipped = np.clip(action.reshape(space.shape), space.low, space.high).astype(space.dtype)
         observation, reward, terminated, truncated, _ = self._environments[simulator].step(clipped)
-        self._observations[simulator] = np.asarray(observation, np.float64).ravel()
+        seen = np.asarray(observation, np.float64).ravel()
+        if not np.isfinite(seen).all():
+            raise FloatingPointError(f"step {elapsed + 1} of an episode gave an observation that is not finite: {seen}")
+        self._observations[simulator] = seen
         self._elapsed[simulator] += 1
         self._returns[simulator] += float(reward)
         self._terminated[simulator] = terminated

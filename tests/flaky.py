@@ -1,0 +1,55 @@
+"""A pendulum that misbehaves now and then in child processes, as told by files: each is one misdeed, done once."""
+
+import multiprocessing
+import os
+import random
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.classic_control.pendulum import PendulumEnv
+
+FOLDER_VARIABLE = "OODIL_TEST_MISDEEDS"
+MISDEEDS = ("raises", "segfault", "exits", "stalls", "nan")
+CHANCE = 1 / 500
+"""Of doing the next misdeed in a step."""
+
+
+def allow(folder: Path, number: int) -> None:
+    """Let every misdeed be done once more."""
+    for misdeed in MISDEEDS:
+        (folder / f"{misdeed}.{number}").touch()
+
+
+class FlakyPendulum(PendulumEnv):
+    """Pendulum-v1 with misdeeds that are not drawn from its seed."""
+
+    def step(self, u: Any) -> Any:
+        misdeed = self._misdeed()
+        if misdeed == "raises":
+            raise RuntimeError("the simulator says no")
+        if misdeed == "segfault":
+            os.kill(os.getpid(), signal.SIGSEGV)
+        if misdeed == "exits":
+            os._exit(3)
+        if misdeed == "stalls":
+            time.sleep(3600)
+        outcome = super().step(u)
+        return (np.full(3, np.nan, np.float32), *outcome[1:]) if misdeed == "nan" else outcome
+
+    def _misdeed(self) -> str:
+        if random.SystemRandom().random() > CHANCE or multiprocessing.parent_process() is None:
+            return ""
+        for file in sorted(Path(os.environ[FOLDER_VARIABLE]).iterdir()):
+            try:
+                file.unlink()
+            except FileNotFoundError:
+                continue
+            return file.stem
+        return ""
+
+
+gymnasium.register("FlakyPendulum-v0", entry_point=FlakyPendulum, max_episode_steps=200)
