@@ -159,8 +159,8 @@ class SourceConfig(_Section):
     """Its name in reports."""
     dynamics: dict[str, float] = {}
     """Keyword arguments of the environment: the demonstrator's own dynamics."""
-    expert: Path
-    """Folder of a saved expert, relative to the configuration file."""
+    expert: Literal["hand-written"] | Path
+    """Folder of a saved expert, relative to the configuration file, or the controller that the environment brings."""
     expert_discount: UnitInterval = 0.995
     """Discount with which its expert is trained; flights are long under low gravity and want a longer horizon."""
     count: PositiveInt
@@ -180,6 +180,9 @@ class DemonstrationsConfig(_Section):
     """Collect with mean actions instead of sampled ones."""
     full_length_only: bool = True
     """Keep only episodes that last to the time limit, as the paper does."""
+    minimum_return: float | None = None
+    """Keep only episodes with at least this true return in the demonstrator's own environment. However it ended, such
+    an episode has not failed."""
 
     @model_validator(mode="after")
     def _one_origin(self) -> "DemonstrationsConfig":

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.data import Episode
 from pipeline.environments import Simulators, make_batch
-from pipeline.policy import GaussianPolicy
+from pipeline.policy import Controller, GaussianPolicy
 from pipeline.seeding import Key, generator
 
 FILM_EVERY = 4
@@ -33,19 +33,19 @@ class Evaluation:
 
 
 def run_episodes(
-    simulators: Simulators, policy: GaussianPolicy, rng: np.random.Generator, *, stochastic: bool
+    simulators: Simulators, controller: Controller, rng: np.random.Generator, *, stochastic: bool
 ) -> list[Episode]:
-    """Run one fresh episode in every simulator side by side."""
+    """Run one fresh episode in every simulator side by side; only a Gaussian policy can be ``stochastic``."""
     count = simulators.num_simulators
     for g in range(count):
         simulators.reset(g, seed=int(rng.integers(2**31)))
     trace = [simulators.observations().astype(np.float32)]
     returns, lengths, terminated = np.zeros(count), np.zeros(count, np.int64), np.zeros(count, np.bool_)
-    std = np.exp(policy.log_std)
     while not lengths.all():
-        actions: NDArray[np.floating] = policy.mean(simulators.observations())
+        actions: NDArray[np.floating] = controller.mean(simulators.observations())
         if stochastic:
-            actions = actions + std * rng.standard_normal(actions.shape, dtype=np.float32)
+            assert isinstance(controller, GaussianPolicy)
+            actions = actions + np.exp(controller.log_std) * rng.standard_normal(actions.shape, dtype=np.float32)
         outcome = simulators.step(actions)
         trace.append(simulators.observations().astype(np.float32))
         ended = (outcome.terminated | outcome.truncated) & (lengths == 0)

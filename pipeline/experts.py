@@ -4,15 +4,18 @@ This is the only place where the environment's reward is learned from. A saved e
 policy and, beside it, what it reaches.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import gymnasium
 
 from pipeline.artifacts import Artifact, Checkpoints, Files, encode_arrays, encode_json, read_artifact
 from pipeline.config import EnvironmentConfig, PpoConfig, TrainingConfig, ValueConfig
 from pipeline.data import DataError, Demonstrations, Episode
 from pipeline.environments import make_batch
 from pipeline.evaluation import run_episodes
-from pipeline.policy import GaussianPolicy
+from pipeline.policy import Controller, GaussianPolicy
 from pipeline.seeding import derive_key, generator
 from pipeline.stage import JobContext
 
@@ -69,8 +72,18 @@ def load_expert(path: Path) -> tuple[GaussianPolicy, Artifact]:
         raise ExpertError(str(error)) from error
 
 
+def hand_written(environment: EnvironmentConfig) -> Controller:
+    """Return the controller that an environment brings along. Raises ExpertError if it brings none."""
+    arguments: dict[str, Any] = dict(environment.dynamics)
+    task: Any = gymnasium.make(environment.id, disable_env_checker=True, **arguments).unwrapped
+    if not hasattr(task, "demonstrator"):
+        raise ExpertError(f"{environment.id} brings no hand-written controller; name the folder of a saved expert")
+    controller: Controller = task.demonstrator()
+    return controller
+
+
 def collect_demonstrations(
-    policy: GaussianPolicy,
+    controller: Controller,
     environment: EnvironmentConfig,
     label: str,
     count: int,
@@ -78,9 +91,12 @@ def collect_demonstrations(
     *,
     deterministic: bool,
     full_length_only: bool,
+    minimum_return: float | None,
     context: JobContext,
 ) -> tuple[Demonstrations, float]:
     """Collect ``count`` demonstrations and return them with the share of episodes that were kept.
+
+    A hand-written controller does as it does, ``deterministic`` or not.
 
     Raises DataError when fewer than one episode in ten can be kept.
     """
@@ -90,13 +106,18 @@ def collect_demonstrations(
     while len(kept) < count:
         rounds += 1
         key = derive_key(seed, "demonstrations", label, rounds)
-        episodes = run_episodes(simulators, policy, generator(key), stochastic=not deterministic)
-        full = simulators.max_episode_steps + 1
-        kept += [episode for episode in episodes if not full_length_only or len(episode.states) == full]
+        stochastic = isinstance(controller, GaussianPolicy) and not deterministic
+        episodes = run_episodes(simulators, controller, generator(key), stochastic=stochastic)
+        if full_length_only:
+            episodes = [each for each in episodes if len(each.states) == simulators.max_episode_steps + 1]
+        if minimum_return is not None:
+            episodes = [replace(each, terminated=False) for each in episodes if each.env_return >= minimum_return]
+        kept += episodes
         if len(kept) * 10 < rounds * COLLECTION_SIMULATORS:
             raise DataError(
-                f"source {label!r}: only {len(kept)} of {rounds * COLLECTION_SIMULATORS} episodes last the full "
-                f"{simulators.max_episode_steps} steps; train a better expert or set full_length_only: false"
+                f"source {label!r}: only {len(kept)} of {rounds * COLLECTION_SIMULATORS} episodes can be kept "
+                f"(full_length_only: {full_length_only}, minimum_return: {minimum_return}); train a better expert or "
+                "ask for less"
             )
         context.progress(min(len(kept), count), count)
     share = len(kept) / (rounds * COLLECTION_SIMULATORS)

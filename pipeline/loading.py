@@ -94,7 +94,10 @@ def _models(field: Any) -> list[type[BaseModel]]:
 def _resolve_paths(config: RunConfig, base: Path) -> RunConfig:
     demonstrations = config.demonstrations
     file = base / demonstrations.file if demonstrations.file else None
-    sources = tuple(s.model_copy(update={"expert": base / s.expert}) for s in demonstrations.sources)
+    sources = tuple(
+        s if isinstance(s.expert, str) else s.model_copy(update={"expert": base / s.expert})
+        for s in demonstrations.sources
+    )
     return config.model_copy(
         update={"demonstrations": demonstrations.model_copy(update={"file": file, "sources": sources})}
     )

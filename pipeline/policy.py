@@ -5,11 +5,19 @@ trained lives in `pipeline.algorithms.networks`; a test holds the two together.
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
+
+
+class Controller(Protocol):
+    """Whatever acts: a policy, or a controller that somebody wrote."""
+
+    def mean(self, observations: NDArray[np.float64]) -> Array:
+        """Return (G, A) actions for (G, S) observations."""
 
 
 @dataclass(frozen=True)

@@ -15,14 +15,13 @@ from pipeline.environments.replay import ReplayBatch, refuse_randomness
 MAX_EPISODE_STEPS = 1000
 
 for _id, _class in {
-    "oodil/Hopper-v0": "HopperEnv",
-    "oodil/Walker2d-v0": "Walker2dEnv",
-    "oodil/HalfCheetah-v0": "HalfCheetahEnv",
+    "oodil/Hopper-v0": "mujoco:HopperEnv",
+    "oodil/Walker2d-v0": "mujoco:Walker2dEnv",
+    "oodil/HalfCheetah-v0": "mujoco:HalfCheetahEnv",
+    "oodil/Driving-v0": "driving:DrivingEnv",
 }.items():
     if _id not in gymnasium.registry:
-        gymnasium.register(
-            _id, entry_point=f"pipeline.environments.mujoco:{_class}", max_episode_steps=MAX_EPISODE_STEPS
-        )
+        gymnasium.register(_id, entry_point=f"pipeline.environments.{_class}", max_episode_steps=MAX_EPISODE_STEPS)
 
 
 def make_batch(env_id: str, dynamics: Mapping[str, float], num_simulators: int) -> Simulators:
@@ -47,6 +46,9 @@ def make_batch(env_id: str, dynamics: Mapping[str, float], num_simulators: int) 
         raise ValueError(f"environment {env_id!r} has no time limit; register it with max_episode_steps")
     if hasattr(task, "healthy_bounds"):
         return MujocoBatch(task, num_simulators, limit)
+    if hasattr(task, "batched"):
+        batch: Simulators = task.batched(num_simulators, limit)
+        return batch
     others = [gymnasium.make(env_id, disable_env_checker=True, **arguments) for _ in range(num_simulators - 1)]
     try:
         return ReplayBatch([env, *others], limit)

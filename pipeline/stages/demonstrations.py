@@ -10,7 +10,8 @@ from pipeline.artifacts import Files, encode_json
 from pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
 from pipeline.data import DataError, Demonstrations
 from pipeline.datasets import decode_demonstrations, encode_demonstrations, read_demonstrations
-from pipeline.experts import collect_demonstrations, load_expert
+from pipeline.experts import collect_demonstrations, hand_written, load_expert
+from pipeline.policy import Controller
 from pipeline.stage import JobContext, Run, Stage
 
 FILE = "demonstrations.safetensors"
@@ -30,10 +31,10 @@ class DemonstrationsStage(Stage):
         if section.file is not None:
             return common | {"file_sha256": hashlib.sha256(section.file.read_bytes()).hexdigest()}
         sources = [
-            source.model_dump(mode="json", exclude={"expert"}) | {"expert_sha256": load_expert(source.expert)[1].sha256}
+            source.model_dump(mode="json", exclude={"expert"}) | {"expert_sha256": _identity(source)}
             for source in section.sources
         ]
-        flags = {"deterministic": section.deterministic, "full_length_only": section.full_length_only}
+        flags = section.model_dump(include={"deterministic", "full_length_only", "minimum_return"})
         return common | flags | {"sources": sources}
 
     def jobs(self, run: Run) -> list[str]:
@@ -50,15 +51,16 @@ class DemonstrationsStage(Stage):
             return _files(demonstrations, config, {})
         names = self.jobs(run)
         source = section.sources[names.index(job)]
-        policy, _ = load_expert(source.expert)
+        environment = EnvironmentConfig(id=config.environment.id, dynamics=source.dynamics)
         demonstrations, kept = collect_demonstrations(
-            policy,
-            EnvironmentConfig(id=config.environment.id, dynamics=source.dynamics),
+            _controller(source, environment),
+            environment,
             source.label,
             source.count,
             config.seed,
             deterministic=section.deterministic,
             full_length_only=section.full_length_only,
+            minimum_return=section.minimum_return,
             context=context,
         )
         return {
@@ -107,12 +109,23 @@ def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
         if environment and environment != config.environment.id:
             raise DataError(f"{section.file}: recorded in {environment}, but the run is for {config.environment.id}")
     for source in section.sources:
+        if isinstance(source.expert, str):
+            hand_written(EnvironmentConfig(id=config.environment.id, dynamics=source.dynamics))
+            continue
         policy, _ = load_expert(source.expert)
         if len(policy.input_mean) != observation_dim:
             raise DataError(
                 f"{source.expert}: the expert sees {len(policy.input_mean)} dimensions; "
                 f"environment {config.environment.id} has {observation_dim}"
             )
+
+
+def _controller(source: SourceConfig, environment: EnvironmentConfig) -> Controller:
+    return hand_written(environment) if isinstance(source.expert, str) else load_expert(source.expert)[0]
+
+
+def _identity(source: SourceConfig) -> str:
+    return source.expert if isinstance(source.expert, str) else load_expert(source.expert)[1].sha256
 
 
 def _job_name(index: int, source: SourceConfig) -> str:

@@ -5,10 +5,11 @@ low one. This selection, like the training itself, uses the true reward, as maki
 sees it.
 """
 
+from pathlib import Path
 from typing import Any
 
 from pipeline.artifacts import Files, encode_json, write_artifact
-from pipeline.config import EnvironmentConfig, RunConfig
+from pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
 from pipeline.evaluation import evaluate
 from pipeline.experts import EXPERT_TRAINING, expert_files, train_expert
 from pipeline.policy import GaussianPolicy
@@ -38,9 +39,13 @@ class ExpertsStage(Stage):
         return {"environment": config.environment.id, "sources": sources, "training": training}
 
     def jobs(self, run: Run) -> list[str]:
-        """Return a job per source and seed."""
-        sources = range(len(run.config.demonstrations.sources))
-        return [_job(i, seed) for i in sources for seed in range(run.config.seed, run.config.seed + TRAININGS)]
+        """Return a job per source and seed; hand-written experts have none."""
+        seeds = range(run.config.seed, run.config.seed + TRAININGS)
+        return [_job(i, seed) for i, _ in self._trained(run) for seed in seeds]
+
+    @staticmethod
+    def _trained(run: Run) -> list[tuple[int, SourceConfig]]:
+        return [(i, s) for i, s in enumerate(run.config.demonstrations.sources) if not isinstance(s.expert, str)]
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Train one expert and say what it reaches with sampled and with mean actions."""
@@ -59,7 +64,7 @@ class ExpertsStage(Stage):
     def combine(self, run: Run) -> Files:
         """Choose the better training of each source."""
         chosen = {}
-        for i, source in enumerate(run.config.demonstrations.sources):
+        for i, source in self._trained(run):
             returns = {
                 job: run.job_artifact(self.name, job).json("expert.json")["stochastic"]["return_mean"]
                 for job in self.jobs(run)
@@ -72,10 +77,10 @@ class ExpertsStage(Stage):
         """Save each source's expert in its folder; return a line about each."""
         chosen = run.artifact(self.name).json("chosen.json")
         lines = []
-        for source in run.config.demonstrations.sources:
+        for _, source in self._trained(run):
             trained = run.job_artifact(self.name, chosen[source.label])
             files = {name: trained.read(name) for name in trained.hashes}
-            write_artifact(source.expert, {"expert": source.dynamics}, files, library_versions())
+            write_artifact(Path(source.expert), {"expert": source.dynamics}, files, library_versions())
             reached = trained.json("expert.json")["stochastic"]
             lines.append(
                 f"{source.label}: return {reached['return_mean']:,.0f} ± {reached['return_std']:,.0f}, "

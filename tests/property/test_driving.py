@@ -1,0 +1,106 @@
+"""The driving world in its batched form against highway-env's own classes, over random worlds, drivers and episodes."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.config import EnvironmentConfig
+from pipeline.environments import make_batch
+from pipeline.environments.driving import GOAL, DrivingBatch, DrivingEnv, layout
+from pipeline.evaluation import run_episodes
+from pipeline.experts import hand_written
+from pipeline.seeding import generator
+
+ID = "oodil/Driving-v0"
+SHARES = st.floats(0.05, 0.45)
+SOURCES = {
+    "target": {"obstacle_1": 0.4, "obstacle_2": 0.25, "speed": 1.0},
+    "wide first obstacle": {"obstacle_1": 0.5, "obstacle_2": 0.25, "speed": 1.0},
+    "wide second obstacle": {"obstacle_1": 0.1, "obstacle_2": 0.5, "speed": 1.0},
+    "fast": {"obstacle_1": 0.25, "obstacle_2": 0.25, "speed": 5.0},
+}
+
+
+@settings(max_examples=25)
+@given(SHARES, SHARES, st.floats(0.5, 8.0), st.integers(0, 2**31 - 1))
+def test_the_batch_drives_as_highway_env_does(first: float, second: float, speed: float, seed: int) -> None:
+    """The same starts and steering: the same observations, rewards and ends, whatever is hit."""
+    dynamics = {"obstacle_1": first, "obstacle_2": second, "speed": speed}
+    batch = make_batch(ID, dynamics, 4)
+    assert isinstance(batch, DrivingBatch)
+    rng = np.random.default_rng(seed)
+    envs = [gymnasium.make(ID, **dynamics) for _ in range(4)]
+    for g, env in enumerate(envs):
+        batch.reset(g, seed + g)
+        observation, _ = env.reset(seed=seed + g)
+        np.testing.assert_array_equal(batch.observations()[g], observation)
+    # Steering that wanders, so that cars turn round, hit the sides of obstacles and leave on all sides.
+    steering = np.clip(np.cumsum(rng.normal(0, 0.2, (400, 4)), axis=0), -1, 1)
+    running = set(range(4))
+    for actions in steering:
+        outcome = batch.step(actions[:, None])
+        for g in sorted(running):
+            observation, reward, terminated, _, _ = envs[g].step(actions[g : g + 1].astype(np.float64))
+            np.testing.assert_allclose(batch.observations()[g], observation, atol=1e-9)
+            assert (outcome.env_rewards[g], outcome.terminated[g]) == (reward, terminated)
+            if terminated:
+                running.remove(g)
+        if not running:
+            break
+
+
+@given(st.floats(0, 60), st.floats(0, 50), st.floats(0, 2 * np.pi), st.sampled_from([0.1, 0.25, 0.5]), st.booleans())
+def test_cars_touch_what_they_touch_in_highway_env(
+    x: float, y: float, heading: float, share: float, is_goal: bool
+) -> None:
+    env = DrivingEnv(share, share, 1.0)
+    env.reset(seed=0)
+    env._car.position, env._car.heading = np.array([x, y]), heading
+    thing = env._goal if is_goal else env._obstacles[1]
+    env._car.handle_collisions(thing)
+    batch = DrivingBatch(layout(share, share, 1.0), 1, 1000)
+    batch._x[0], batch._y[0], batch._heading[0] = x, y, heading
+    touched = batch._touches(GOAL if is_goal else batch.layout.obstacles[1])[0]
+    assert touched == (thing.hit if is_goal else env._car.crashed)
+
+
+def test_gymnasium_finds_nothing_to_complain_about() -> None:
+    check_env(gymnasium.make(ID, render_mode="rgb_array").unwrapped)
+
+
+def test_a_snapshot_continues_to_the_same_bits() -> None:
+    batch, other = make_batch(ID, {}, 3), make_batch(ID, {}, 3)
+    for g in range(3):
+        batch.reset(g, g)
+    actions = np.random.default_rng(0).uniform(-1, 1, (60, 3, 1)).astype(np.float32)
+    for action in actions[:30]:
+        batch.step(action)
+    other.restore(batch.snapshot())
+    for action in actions[30:]:
+        one, two = batch.step(action), other.step(action)
+        assert one.env_rewards.tobytes() == two.env_rewards.tobytes()
+    assert batch.snapshot().states.tobytes() == other.snapshot().states.tobytes()
+    assert batch.episode_returns().tobytes() == other.episode_returns().tobytes()
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_the_driver_reaches_the_goal_in_its_own_world(name: str) -> None:
+    environment = EnvironmentConfig(id=ID, dynamics=SOURCES[name])
+    episodes = run_episodes(
+        make_batch(ID, SOURCES[name], 60), hand_written(environment), generator((0,)), stochastic=False
+    )
+    assert all(episode.env_return > -500 for episode in episodes), "the goal was not reached"
+    speeds = {round(float(np.hypot(*episode.states[-1][2:4])), 4) for episode in episodes}
+    assert speeds == {SOURCES[name]["speed"]}
+
+
+@pytest.mark.parametrize(
+    ("dynamics", "message"),
+    [({"obstacle_1": 1.2}, "obstacle_1 is 1.2"), ({"speed": 0.0}, "speed is 0.0"), ({"gravity": 1.0}, "gravity")],
+)
+def test_a_world_that_cannot_be_is_refused(dynamics: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_batch(ID, dynamics, 1)
