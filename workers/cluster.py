@@ -24,21 +24,9 @@ from pipeline.stage import JobStoppedError, RolloutSource, Run, Stage
 from pipeline.versions import collecting_versions
 from workers import job as job_process
 from workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, JobWarning, OnEvent, Outcome
-from workers.messages import (
-    Failed,
-    Header,
-    MessageError,
-    Progress,
-    Report,
-    ResultMessage,
-    UnitMessage,
-    Warn,
-    decode,
-    decode_report,
-    encode,
-    encode_report,
-    shortened,
-)
+from workers.messages import Header, ResultMessage, UnitMessage, decode, encode
+from workers.reports import Failed, Progress, Report, Warn, decode_report, encode_report
+from workers.wire import MessageError, shortened
 
 _POLL_S = 0.2
 _LOST = "its process or its node is gone; Ray runs it again"

@@ -19,7 +19,7 @@ from pipeline.stage import JobStoppedError, RolloutSource, Run, Stage
 from workers import job as job_process
 from workers import rollout as rollout_process
 from workers.channels import Access, private_endpoint
-from workers.messages import Progress, Silent, Warn
+from workers.reports import Progress, Silent, Warn
 from workers.supervisor import Died, Ended, Restarts, Said, Started, Supervisor
 from workers.supervisor import Event as ChildEvent
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from workers.channels import Access
-from workers.messages import Progress, Silent, Warn, shortened
+from workers.reports import Progress, Silent, Warn
 from workers.supervisor import Link
+from workers.wire import shortened
 
 if TYPE_CHECKING:
     # A job's process says that it runs before it loads what it computes with.

@@ -17,17 +17,8 @@ from pipeline.rollout import Unit, UnitResult
 from pipeline.stage import JobStoppedError
 from pipeline.versions import collecting_versions
 from workers.channels import Access, Router
-from workers.messages import (
-    Header,
-    MessageError,
-    Ready,
-    Refused,
-    ResultMessage,
-    UnitFailure,
-    UnitMessage,
-    decode,
-    encode,
-)
+from workers.messages import Header, Ready, Refused, ResultMessage, UnitFailure, UnitMessage, decode, encode
+from workers.wire import MessageError
 
 UNITS_PER_WORKER = 2
 """One in work and one waiting, so that a worker never waits for the learner's answer."""

@@ -9,19 +9,9 @@ from pathlib import Path
 from pipeline.rollout import collect
 from pipeline.versions import collecting_versions
 from workers.channels import Dealer
-from workers.messages import (
-    Header,
-    MessageError,
-    Ready,
-    Refused,
-    ResultMessage,
-    UnitFailure,
-    UnitMessage,
-    decode,
-    encode,
-    shortened,
-)
+from workers.messages import Header, Ready, Refused, ResultMessage, UnitFailure, UnitMessage, decode, encode
 from workers.supervisor import Link
+from workers.wire import MessageError, shortened
 
 READY_INTERVAL_S = 1.0
 _POLL_S = 0.1

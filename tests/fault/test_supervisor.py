@@ -14,7 +14,7 @@ import pytest
 from tests.fakes import STAGES, FakeStage, fake_run, lines, wait_until
 from workers.channels import endpoint_folder
 from workers.engine import Event, JobFailed, JobWarning, LocalEngine, WorkerRestarted
-from workers.messages import Progress
+from workers.reports import Progress
 from workers.supervisor import Died, Ended, Link, Restarts, Said, Started, Supervisor
 from workers.supervisor import Event as ChildEvent
 

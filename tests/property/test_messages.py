@@ -17,27 +17,9 @@ from pipeline.environments import Snapshot
 from pipeline.policy import GaussianPolicy
 from pipeline.rollout import Rollout, Unit, UnitResult
 from workers import messages
-from workers.messages import (
-    Failed,
-    Finished,
-    Header,
-    Message,
-    MessageError,
-    Progress,
-    Ready,
-    Refused,
-    Report,
-    ResultMessage,
-    Silent,
-    Stop,
-    UnitFailure,
-    UnitMessage,
-    Warn,
-    decode,
-    decode_report,
-    encode,
-    encode_report,
-)
+from workers.messages import Header, Message, Ready, Refused, ResultMessage, UnitFailure, UnitMessage, decode, encode
+from workers.reports import Failed, Finished, Progress, Report, Silent, Stop, Warn, decode_report, encode_report
+from workers.wire import MessageError, shortened
 
 texts = st.text(max_size=50)
 plain_texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=50)
@@ -326,6 +308,6 @@ def test_any_text_can_be_reported(text: str) -> None:
 
 
 def test_a_long_traceback_keeps_its_ends() -> None:
-    text = messages.shortened("first" + "x" * 10**6 + "last")
+    text = shortened("first" + "x" * 10**6 + "last")
     assert text.startswith("first") and text.endswith("last")
     assert decode_report(encode_report(Failed(text))) == Failed(text)
