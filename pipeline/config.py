@@ -280,9 +280,6 @@ class TransferabilityConfig(_Section):
     """Times the demonstrations are scored while a job runs, evenly spaced."""
     averaged_scores: PositiveInt = 5
     """Window of the moving average of scores, of whose last third the most convinced decides."""
-    settled_change: PositiveFloat | None = 0.1
-    """A job ends before its budget does, from 70 % of it on, once what is read from its scores moves by less than this
-    (in log-odds) while a tenth of the budget is spent; null spends all of it."""
     sharpening: float = Field(default=4.0, gt=0.0)
     """Power to which a transferability is raised to become a weight; 1 is the paper's form (docs/decisions.md)."""
 

@@ -96,9 +96,8 @@ def train(
     probes: list[Probe],
     context: JobContext,
     checkpoints: Checkpoints,
-    is_over: Callable[[History], bool] = lambda history: False,
 ) -> History:
-    """Train until the budget is spent or ``is_over`` of what was measured, from the newest checkpoint if there is one.
+    """Train until the budget is spent, from the newest checkpoint if there is one.
 
     Raises JobStoppedError, after writing a checkpoint, when the context asks for a stop.
     """
@@ -106,13 +105,8 @@ def train(
     position = _resume(learner, config, context, checkpoints)
     last_checkpoint = time.monotonic()
     returns, lengths = _Recent(), _Recent()
-
-    def has_ended() -> bool:
-        return position.iteration == config.num_iterations or is_over(position.history)
-
-    if has_ended():
-        return position.history
-    context.rollouts.submit(_units(position, learner.root_seed, environment, config))
+    if position.iteration < config.num_iterations:
+        context.rollouts.submit(_units(position, learner.root_seed, environment, config))
     for iteration in range(position.iteration, config.num_iterations):
         results = context.rollouts.gather()
         rollouts = [result.rollout for result in results]
@@ -144,9 +138,7 @@ def train(
         if stop or time.monotonic() - last_checkpoint >= context.checkpoint_interval_s:
             _save(learner, position, checkpoints)
             last_checkpoint = time.monotonic()
-        if has_ended():
-            break
-        if stop:
+        if stop and position.iteration < config.num_iterations:
             raise JobStoppedError(f"stopped after {env_steps} environment steps")
     return position.history
 

@@ -10,9 +10,6 @@ from pipeline.data import Demonstrations
 
 Array = NDArray[np.float64]
 
-EARLIEST_END = 0.7
-"""Share of a job's budget that is spent in any case."""
-
 
 def most_convinced(logits: Array, window: int) -> Array:
     """Return (N,) the highest moving average over ``window`` of the last third of a job's mean logits (E, N).
@@ -24,19 +21,6 @@ def most_convinced(logits: Array, window: int) -> Array:
     window = min(window, len(settled))
     sums = np.cumsum(np.concatenate((np.zeros((1, settled.shape[1])), settled)), axis=0)
     return np.asarray(((sums[window:] - sums[:-window]) / window).max(axis=0))
-
-
-def has_settled(logits: Array, num_scores: int, window: int, change: float) -> bool:
-    """Return whether a job of ``num_scores`` scores may end after the first of them, its mean logits (E, N).
-
-    It may once what `most_convinced` reads from them, averaged over the demonstrations, stays within ``change`` for a
-    tenth of the job. Before 70 % of it scores that will fall have often not begun to.
-    """
-    span = max(1, num_scores // 10)
-    if len(logits) < max(EARLIEST_END * num_scores, span + 1):
-        return False
-    readings = [most_convinced(logits[:end], window).mean() for end in range(len(logits) - span, len(logits) + 1)]
-    return bool(max(readings) - min(readings) < change)
 
 
 def transferability(mean_logits: Array) -> Array:

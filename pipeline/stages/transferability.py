@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from pipeline.algorithms.transferability import (
-    has_settled,
     most_convinced,
     sampling_mass,
     share_lasted,
@@ -43,8 +42,6 @@ class TransferabilityStage(Stage):
         return {
             "gail": section.gail.model_dump(mode="json"),
             "num_scores": section.num_scores,
-            "averaged_scores": section.averaged_scores,
-            "settled_change": section.settled_change,
             "environment": config.environment.model_dump(),
         }
 
@@ -56,7 +53,7 @@ class TransferabilityStage(Stage):
         """Imitate one cluster in the imitator's environment and score its demonstrations along the way."""
         from pipeline.algorithms.gail import AdversarialReward
         from pipeline.algorithms.learner import Learner
-        from pipeline.training import History, Probe, train
+        from pipeline.training import Probe, train
 
         config = run.config
         section = config.transferability
@@ -67,13 +64,7 @@ class TransferabilityStage(Stage):
         reward = AdversarialReward(demonstrations, np.ones(len(members)), section.gail.discriminator, seed)
         learner = Learner(simulators.observation_dim, simulators.action_dim, section.gail, reward, seed)
         probe = Probe("logits", section.num_scores, lambda: reward.mean_logits(demonstrations))
-
-        def is_over(history: History) -> bool:
-            change, logits = section.settled_change, history.values("logits")
-            return change is not None and has_settled(logits, section.num_scores, section.averaged_scores, change)
-
-        checkpoints = self.checkpoints(run, job)
-        history = train(learner, config.environment, section.gail, [probe], context, checkpoints, is_over)
+        history = train(learner, config.environment, section.gail, [probe], context, self.checkpoints(run, job))
         discriminator = {name: value.numpy() for name, value in reward.discriminator.state_dict().items()}
         return {
             _JOB_FILE: encode_arrays(

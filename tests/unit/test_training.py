@@ -2,14 +2,13 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from pipeline.algorithms.learner import EnvReward, Learner
 from pipeline.artifacts import Checkpoints
 from pipeline.config import EnvironmentConfig, TrainingConfig, ValueConfig
 from pipeline.rollout import InlineRollouts
-from pipeline.training import History, Probe, train
+from pipeline.training import train
 
 
 class Context:
@@ -43,28 +42,3 @@ def test_a_training_that_diverges_names_the_figure_and_leaves_no_checkpoint_of_i
         train(learner, EnvironmentConfig(), config, [], Context(), checkpoints)
     arrays, _ = checkpoints.load()
     assert arrays is None or all((value == value).all() for value in arrays.values())
-
-
-def test_a_training_that_is_over_early_stays_so(tmp_path: Path) -> None:
-    """It ends after the third measurement, and a checkpoint from there is not trained any further."""
-    config = TrainingConfig(total_steps=200, num_groups=1, simulators_per_group=2, steps_per_rollout=20)
-    measured = []
-
-    def run() -> History:
-        learner = Learner(12, 3, config, EnvReward(), root_seed=0)
-        probe = Probe("number", 5, lambda: measured.append(None) or np.array(len(measured)))
-        return train(
-            learner,
-            EnvironmentConfig(),
-            config,
-            [probe],
-            Context(),
-            Checkpoints(tmp_path, {}),
-            lambda history: len(history.steps("number")) == 3,
-        )
-
-    for _ in range(2):
-        history = run()
-        assert history.steps("number").tolist() == [40, 80, 120]
-        assert history.values("number").tolist() == [1, 2, 3]
-    assert len(measured) == 3

@@ -8,7 +8,6 @@ import torch
 
 from pipeline.algorithms.discriminator import Discriminator, mean_logit_per_demonstration
 from pipeline.algorithms.transferability import (
-    has_settled,
     most_convinced,
     sampling_mass,
     share_lasted,
@@ -41,19 +40,6 @@ def test_the_most_convinced_of_the_last_third_decides():
 
 def test_transferability_is_half_where_nothing_can_be_told_and_falls_with_the_logit():
     np.testing.assert_allclose(transferability(np.array([0.0, np.log(3.0), -np.log(3.0)])), [0.5, 0.25, 0.75])
-
-
-def test_a_job_has_settled_when_its_reading_stays_within_the_change_for_a_tenth_of_it():
-    """Of 20 scores: from the 14th on, when three readings in a row differ by less than 0.1."""
-    falling = np.linspace(0, 19, 20)[:, None] * [1.0, 1.0]
-    assert not any(has_settled(falling[:end], 20, 1, 0.1) for end in range(21))
-    still = np.concatenate((falling[:10], np.full((10, 2), 9.0)))
-    assert [end for end in range(21) if has_settled(still[:end], 20, 1, 0.1)] == list(range(14, 21))
-    moved = still.copy()
-    moved[15] = 9.2
-    # The highest of the last third is read, so one jump up lasts until the end; with the limit above it, it is no move.
-    assert [end for end in range(21) if has_settled(moved[:end], 20, 1, 0.1)] == [14, 15, 18, 19, 20]
-    assert [end for end in range(21) if has_settled(moved[:end], 20, 1, 0.3)] == list(range(14, 21))
 
 
 def test_a_failure_counts_for_the_part_of_the_horizon_that_it_lasted(demonstrations):
