@@ -85,6 +85,9 @@ class DiscriminatorConfig(_Section):
     """Adam's step size."""
     steps_per_iteration: PositiveInt = 1
     """Full-batch steps after each policy update."""
+    reward: Literal["positive", "logit"] = "positive"
+    """-log(1 - D), which also pays for going on, for tasks that end by failure; or log D - log(1 - D), for tasks that
+    end by success."""
 
 
 class TrainingConfig(_Section):

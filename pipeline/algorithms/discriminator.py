@@ -6,6 +6,8 @@ comes from a demonstration, label 1 is the demonstration and 0 the policy. The p
 Letters: N demonstrations, B batch, M demonstration pairs, S observation.
 """
 
+from typing import Literal
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -23,12 +25,13 @@ def discriminator_loss(demonstration_logits: Tensor, policy_logits: Tensor) -> T
     return softplus(-demonstration_logits).mean() + softplus(policy_logits).mean()
 
 
-def imitation_reward(logits_expert_is_high: Tensor) -> Tensor:
-    """Return -log(1 - D), (B,): positive, and large where a pair looks like a demonstration (method: reward of GAIL).
+def imitation_reward(logits_expert_is_high: Tensor, kind: Literal["positive", "logit"]) -> Tensor:
+    """Return (B,) rewards, large where a pair looks like a demonstration.
 
-    A positive reward also pays for staying alive; see docs/algorithms.md.
+    ``positive`` is -log(1 - D), the reward of GAIL. It also pays for going on; see docs/algorithms.md. ``logit`` is
+    log D - log(1 - D), the logit itself, the reward of AIRL (Fu et al. 2018, https://arxiv.org/abs/1710.11248).
     """
-    return softplus(logits_expert_is_high)
+    return softplus(logits_expert_is_high) if kind == "positive" else logits_expert_is_high
 
 
 class Discriminator(nn.Module):

@@ -59,7 +59,8 @@ class AdversarialReward:
     @torch.no_grad()
     def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:
         """Return (T, G) rewards of the discriminator before its own step of the same iteration."""
-        rewards = imitation_reward(self.discriminator(self._policy_pairs(rollouts))).numpy()
+        logits = self.discriminator(self._policy_pairs(rollouts))
+        rewards = imitation_reward(logits, self.discriminator.config.reward).numpy()
         return rewards.reshape(rollouts[0].terminated.shape[0], -1)
 
     def update(self, rollouts: list[Rollout], iteration: int, step_scale: float) -> dict[str, float]:
