@@ -281,8 +281,8 @@ class TransferabilityConfig(_Section):
     end, and the scores of what cannot be reproduced rise."""
     num_scores: int = Field(default=100, ge=2)
     """Times the demonstrations are scored while a job runs, evenly spaced."""
-    averaged_scores: PositiveInt = 5
-    """Window of the moving average of scores, of whose last third the most convinced decides."""
+    final_steps: PositiveInt = 100
+    """Steps that the discriminator takes against the finished imitator, which no longer learns, before it is read."""
     sharpening: float = Field(default=4.0, gt=0.0)
     """Power to which a transferability is raised to become a weight; 1 is the paper's form (docs/decisions.md)."""
 

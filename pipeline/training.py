@@ -19,7 +19,7 @@ from pipeline.config import EnvironmentConfig, TrainingConfig
 from pipeline.environments import Snapshot
 from pipeline.policy import GaussianPolicy
 from pipeline.rollout import Rollout, Unit
-from pipeline.seeding import derive_key
+from pipeline.seeding import derive_key, torch_seed
 from pipeline.stage import JobContext, JobStoppedError
 
 Arrays = dict[str, NDArray]
@@ -141,6 +141,27 @@ def train(
         if stop and position.iteration < config.num_iterations:
             raise JobStoppedError(f"stopped after {env_steps} environment steps")
     return position.history
+
+
+def experience(
+    policy: GaussianPolicy,
+    environment: EnvironmentConfig,
+    config: TrainingConfig,
+    num_steps: int,
+    root_seed: int,
+    context: JobContext,
+) -> list[Rollout]:
+    """Collect at least ``num_steps`` steps of every simulator under one policy, beginning with fresh episodes."""
+    position = _Position(0, 0, policy, [None] * config.num_groups, History())
+    seed = torch_seed(derive_key(root_seed, "experience"))
+    rollouts: list[Rollout] = []
+    while position.iteration * config.steps_per_rollout < num_steps:
+        context.rollouts.submit(_units(position, seed, environment, config))
+        results = context.rollouts.gather()
+        rollouts += [result.rollout for result in results]
+        position.snapshots = [result.snapshot for result in results]
+        position.iteration += 1
+    return rollouts
 
 
 class _Recent:

@@ -75,6 +75,19 @@ class AdversarialReward:
             metrics = self.discriminator.update(self.draw(count, rng), policy_pairs)
         return metrics
 
+    def settle(self, rollouts: list[Rollout], steps: int, batch_size: int) -> None:
+        """Go on with the discriminator alone, against rollouts of a policy that no longer learns.
+
+        While both learn, a discriminator is always behind: for a while even an imitator that fails may fool it. Each of
+        the ``steps`` draws ``batch_size`` pairs from either side.
+        """
+        self.discriminator.optimiser.learning_rate = self.discriminator.config.learning_rate
+        policy_pairs = self._policy_pairs(rollouts)
+        rng = generator(derive_key(self.root_seed, "discriminator", "settle"))
+        for _ in range(steps):
+            chosen = torch.from_numpy(rng.integers(len(policy_pairs), size=batch_size))
+            self.discriminator.update(self.draw(batch_size, rng), policy_pairs[chosen])
+
     def draw(self, count: int, rng: np.random.Generator) -> Tensor:
         """Draw ``count`` demonstration pairs with replacement, in proportion to the weights."""
         points = rng.random(count) * self._cumulative[-1]

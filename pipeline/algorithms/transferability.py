@@ -1,6 +1,6 @@
 """From logits to transferability to weights: the paper's Eqn (6) and (7).
 
-Letters: N demonstrations, E scores taken while a job ran.
+Letters: N demonstrations, E scores taken while a job ran and at its end.
 """
 
 import numpy as np
@@ -9,18 +9,6 @@ from numpy.typing import NDArray
 from pipeline.data import Demonstrations
 
 Array = NDArray[np.float64]
-
-
-def most_convinced(logits: Array, window: int) -> Array:
-    """Return (N,) the highest moving average over ``window`` of the last third of a job's mean logits (E, N).
-
-    The discriminators of a GAIL job come and go; some are fooled for a while even by an imitator that fails. What can
-    be reproduced passes with every one of them once the imitator has learned it, so the most convinced one decides.
-    """
-    settled = logits[2 * len(logits) // 3 :]
-    window = min(window, len(settled))
-    sums = np.cumsum(np.concatenate((np.zeros((1, settled.shape[1])), settled)), axis=0)
-    return np.asarray(((sums[window:] - sums[:-window]) / window).max(axis=0))
 
 
 def transferability(mean_logits: Array) -> Array:

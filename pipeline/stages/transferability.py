@@ -1,7 +1,7 @@
 """Stage 3: one independent GAIL job per cluster; what its discriminators say of every demonstration (Eqn 5 and 6).
 
-The scores come from the discriminators of the last third of each job. The true reward plays no part, not even in
-choosing among them.
+The scores are read from each job's discriminator after it has gone on learning for a while against the finished
+imitator. The true reward plays no part.
 """
 
 from typing import Any
@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from pipeline.algorithms.transferability import (
-    most_convinced,
     sampling_mass,
     share_lasted,
     sharpened_weights,
@@ -42,6 +41,7 @@ class TransferabilityStage(Stage):
         return {
             "gail": section.gail.model_dump(mode="json"),
             "num_scores": section.num_scores,
+            "final_steps": section.final_steps,
             "environment": config.environment.model_dump(),
         }
 
@@ -53,7 +53,7 @@ class TransferabilityStage(Stage):
         """Imitate one cluster in the imitator's environment and score its demonstrations along the way."""
         from pipeline.algorithms.gail import AdversarialReward
         from pipeline.algorithms.learner import Learner
-        from pipeline.training import Probe, train
+        from pipeline.training import Probe, experience, train
 
         config = run.config
         section = config.transferability
@@ -65,6 +65,11 @@ class TransferabilityStage(Stage):
         learner = Learner(simulators.observation_dim, simulators.action_dim, section.gail, reward, seed)
         probe = Probe("logits", section.num_scores, lambda: reward.mean_logits(demonstrations))
         history = train(learner, config.environment, section.gail, [probe], context, self.checkpoints(run, job))
+        policy = learner.behaviour_policy()
+        rollouts = experience(policy, config.environment, section.gail, simulators.max_episode_steps, seed, context)
+        reward.settle(rollouts, section.final_steps, section.gail.steps_per_iteration)
+        env_steps = int(history.steps("logits")[-1]) + sum(rollout.terminated.size for rollout in rollouts)
+        history.append("logits", env_steps, reward.mean_logits(demonstrations))
         discriminator = {name: value.numpy() for name, value in reward.discriminator.state_dict().items()}
         return {
             _JOB_FILE: encode_arrays(
@@ -75,7 +80,7 @@ class TransferabilityStage(Stage):
                 }
             ),
             "discriminator.safetensors": encode_arrays(discriminator),
-            "policy.safetensors": encode_arrays(learner.behaviour_policy().arrays()),
+            "policy.safetensors": encode_arrays(policy.arrays()),
         }
 
     def combine(self, run: Run) -> Files:
@@ -86,7 +91,7 @@ class TransferabilityStage(Stage):
         history = {}
         for job in self.jobs(run):
             arrays = run.job_artifact(self.name, job).arrays(_JOB_FILE)
-            logits[arrays["demonstrations"]] = most_convinced(arrays["logits"], config.transferability.averaged_scores)
+            logits[arrays["demonstrations"]] = arrays["logits"][-1]
             cluster = job.replace("-", "_")
             history[f"{cluster}/env_steps"] = arrays["env_steps"]
             history[f"{cluster}/scores"] = transferability(arrays["logits"])

@@ -165,3 +165,14 @@ def test_step_scale_multiplies_the_step_size(demonstrations, rollout):
 
     assert moved(1.0) == pytest.approx(1e-2, rel=1e-2)
     assert moved(0.25) == pytest.approx(0.25e-2, rel=1e-2)
+
+
+def test_a_settled_discriminator_tells_a_policy_that_no_longer_learns(demonstrations, rollout, assert_same_bits):
+    """Demonstrations that the rollouts do not resemble become certain; nothing but the two sides decides the bits."""
+    shown, rollouts = demonstrations(20, 20), [rollout(0, num_steps=30), rollout(1, num_steps=30)]
+    one, two = build(shown, [1.0, 1.0], learning_rate=1e-2), build(shown, [1.0, 1.0], learning_rate=1e-2)
+    before = one.mean_logits(shown)
+    one.settle(rollouts, steps=100, batch_size=64)
+    two.settle(rollouts, steps=100, batch_size=64)
+    assert (one.mean_logits(shown) > before + 2).all()
+    assert_same_bits(one.state(), two.state())

@@ -8,7 +8,6 @@ import torch
 
 from pipeline.algorithms.discriminator import Discriminator, mean_logit_per_demonstration
 from pipeline.algorithms.transferability import (
-    most_convinced,
     sampling_mass,
     share_lasted,
     sharpened_weights,
@@ -28,14 +27,6 @@ def test_mean_logit_is_over_the_transitions_of_each_demonstration(demonstrations
             states = torch.from_numpy(made[n])
             expected.append(float(discriminator(torch.cat((states[:-1], states[1:]), dim=1)).mean()))
     np.testing.assert_allclose(mean_logit_per_demonstration(discriminator, made), expected, rtol=1e-5)
-
-
-def test_the_most_convinced_of_the_last_third_decides():
-    """Last third (1, 5, 3): averages over 2 are 3 and 4. The 9 before does not count."""
-    logits = np.concatenate((np.full((6, 2), 9.0), [[1.0, -2.0], [5.0, -4.0], [3.0, -3.0]]))
-    np.testing.assert_allclose(most_convinced(logits, 2), [4.0, -3.0])
-    np.testing.assert_allclose(most_convinced(logits, 1), [5.0, -2.0])
-    np.testing.assert_allclose(most_convinced(logits, 99), [3.0, -3.0])
 
 
 def test_transferability_is_half_where_nothing_can_be_told_and_falls_with_the_logit():
