@@ -281,7 +281,7 @@ class TransferabilityConfig(_Section):
     end, and the scores of what cannot be reproduced rise."""
     num_scores: int = Field(default=100, ge=2)
     """Times the demonstrations are scored while a job runs, evenly spaced."""
-    final_steps: PositiveInt = 100
+    final_steps: PositiveInt = 200
     """Steps that the discriminator takes against the finished imitator, which no longer learns, before it is read."""
     sharpening: float = Field(default=4.0, gt=0.0)
     """Power to which a transferability is raised to become a weight; 1 is the paper's form (docs/decisions.md)."""
