@@ -65,6 +65,6 @@ def test_an_expert_is_transferable_and_doing_nothing_is_not(tmp_path: Path) -> N
     arrays = run.artifact(stage.name).arrays("transferability.safetensors")
     scores = arrays["scores"]
     # A settled discriminator is not sure of what can be reproduced, but is of much else: docs/decisions.md.
-    assert scores[~does_nothing].min() > 0.01, scores
+    assert scores[~does_nothing].min() > 0.05, scores
     assert scores[does_nothing].max() < scores[~does_nothing].min() / 2, scores
     assert sampling_mass(arrays["weights"], demonstrations)[does_nothing].sum() < 0.05, scores
