@@ -151,7 +151,7 @@ def main() -> None:
     for env_id in arguments.envs:
         costs, unit, result = real_costs(env_id)
         rates = [intake(workers, unit, result, arguments.seconds) for workers in arguments.workers]
-        busy_s = costs["update_s"] + rates[-1]["learner_s_per_unit"]
+        busy_s = costs["update_s"] + min(rate["learner_s_per_unit"] for rate in rates)
         found["environments"][env_id] = {**costs, "intake": rates, "workers_at_saturation": costs["collect_s"] / busy_s}
         print(f"{env_id}: a unit of {costs['steps']} steps costs its worker {1e3 * costs['collect_s']:.1f} ms")
         size = costs["result_bytes"] / 1e3
