@@ -283,13 +283,13 @@ def _collect(versions: str, frames: list[bytes]) -> list[bytes]:
 
 def _check_nodes(run_path: str) -> None:
     """Look from every node at the run's folder and at its libraries. Raises ConfigError that names the node."""
-    looks: dict[str, Any] = {}
+    looks: list[tuple[str, Any]] = []
     for node in ray.nodes():
         if node["Alive"]:
             there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
             look = ray.remote(_look).options(num_cpus=0, scheduling_strategy=there)
-            looks[node["NodeManagerAddress"]] = look.remote(run_path, collecting_versions())
-    for address, look in looks.items():
+            looks.append((node["NodeManagerAddress"], look.remote(run_path, collecting_versions())))
+    for address, look in looks:
         try:
             sees_run = ray.get(look)
         except ray.exceptions.RayTaskError as error:

@@ -70,11 +70,9 @@ class HopperEnv(hopper_v5.HopperEnv):
     def healthy_bounds(self) -> tuple[Floats, Floats]:
         """Return the bounds of a healthy state (12,), by the rule of Hopper-v5."""
         low, high = _height_and_angle_bounds(self)
-        # Everything but root x and height; the angle has two ranges.
-        for bounds, limit, narrower in zip(
-            (low, high), self._healthy_state_range, (np.maximum, np.minimum), strict=True
-        ):
-            bounds[2:] = narrower(bounds[2:], limit)
+        # One range for all but root x and height; the angle has another one besides.
+        low[2:] = np.maximum(low[2:], self._healthy_state_range[0])
+        high[2:] = np.minimum(high[2:], self._healthy_state_range[1])
         return low, high
 
     def reset_velocity(self, rng: np.random.Generator) -> Floats:
