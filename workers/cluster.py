@@ -20,7 +20,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from pipeline.loading import ConfigError
 from pipeline.rollout import InlineRollouts, Unit, UnitResult, collect
-from pipeline.stage import JobStoppedError, RolloutSource, Run, Stage
+from pipeline.stage import JobStoppedError, Run, Stage
 from pipeline.versions import collecting_versions
 from workers import job as job_process
 from workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, JobWarning, OnEvent, Outcome
@@ -196,55 +196,46 @@ class _Board:
         return self._is_stopping
 
 
-class _Context:
-    """A job's view of the task that it runs in."""
+class _Writer:
+    """A job's end of the board."""
 
-    def __init__(self, board: Any, job: str, rollouts: RolloutSource, checkpoint_interval_s: float) -> None:
-        self.rollouts = rollouts
-        self.checkpoint_interval_s = checkpoint_interval_s
+    def __init__(self, board: Any, job: str) -> None:
         self._board = board
         self._job = job
-        self._next_report = self._next_question = 0.0
+        self._next_question = 0.0
         self._is_stopping = False
 
-    def progress(self, done: int, total: int, **metrics: float) -> None:
-        """Report progress, but not more often than anybody can read."""
-        now = time.monotonic()
-        if now >= self._next_report or done >= total:
-            self._next_report = now + _POLL_S
-            figures = {name: float(value) for name, value in metrics.items()}
-            self.write(Progress(int(done), int(total), figures))
+    def begin(self) -> None:
+        """Note that an attempt begins."""
+        ray.get(self._board.write.remote(self._job, b""))
 
-    def warn(self, message: str) -> None:
-        """Pass a warning on."""
-        self.write(Warn(shortened(message)))
+    def send(self, report: Report) -> None:
+        """Put a report on the board."""
+        ray.get(self._board.write.remote(self._job, encode_report(report)))
 
     def should_stop(self) -> bool:
-        """Return whether the orchestrator asked for an end."""
+        """Return whether the orchestrator asked for an end; it is asked now and then."""
         if not self._is_stopping and time.monotonic() >= self._next_question:
             self._next_question = time.monotonic() + _POLL_S
             self._is_stopping = ray.get(self._board.is_stopping.remote())
         return self._is_stopping
-
-    def write(self, report: Report) -> None:
-        """Put a report on the board."""
-        ray.get(self._board.write.remote(self._job, encode_report(report)))
 
 
 def _run_job(board: Any, run_path: str, stages: str, stage_name: str, job: str) -> str:
     """The task of a job; returns DONE or STOPPED."""
     stage, run = job_process.find(run_path, stages, stage_name)
     rollouts = RayRollouts() if stage.distributed else InlineRollouts()
-    context = _Context(board, job, rollouts, run.config.runtime.checkpoint_interval_s)
-    if context.should_stop():
+    writer = _Writer(board, job)
+    context = job_process.Context(writer.send, writer.should_stop, rollouts, run.config.runtime.checkpoint_interval_s)
+    if writer.should_stop():
         return job_process.STOPPED
-    ray.get(board.write.remote(job, b""))
+    writer.begin()
     try:
         job_process.execute(stage, run, job, context)
     except JobStoppedError:
         return job_process.STOPPED
     except Exception:
-        context.write(Failed(shortened(traceback.format_exc())))
+        writer.send(Failed(shortened(traceback.format_exc())))
         raise
     return job_process.DONE
 

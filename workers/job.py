@@ -2,13 +2,13 @@
 
 import importlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from workers.channels import Access
-from workers.reports import Progress, Silent, Warn
+from workers.reports import Progress, Report, Silent, Warn
 from workers.supervisor import Link
 from workers.wire import shortened
 
@@ -20,13 +20,20 @@ DONE, STOPPED = "done", "stopped"
 _REPORT_INTERVAL_S = 0.2
 
 
-class _Context:
-    """A job's view of its process: what it reports goes through the pipe."""
+class Context:
+    """A job's view of where it runs: ``send`` takes its reports to the orchestrator."""
 
-    def __init__(self, link: Link, rollouts: "RolloutSource", checkpoint_interval_s: float) -> None:
+    def __init__(
+        self,
+        send: Callable[[Report], None],
+        should_stop: Callable[[], bool],
+        rollouts: "RolloutSource",
+        checkpoint_interval_s: float,
+    ) -> None:
+        self.should_stop = should_stop
         self.rollouts = rollouts
         self.checkpoint_interval_s = checkpoint_interval_s
-        self._link = link
+        self._send = send
         self._next_report = 0.0
 
     def progress(self, done: int, total: int, **metrics: float) -> None:
@@ -35,15 +42,11 @@ class _Context:
         if now >= self._next_report or done >= total:
             self._next_report = now + _REPORT_INTERVAL_S
             figures = {name: float(value) for name, value in metrics.items()}
-            self._link.send(Progress(int(done), int(total), figures))
+            self._send(Progress(int(done), int(total), figures))
 
     def warn(self, message: str) -> None:
         """Pass a warning on."""
-        self._link.send(Warn(shortened(message)))
-
-    def should_stop(self) -> bool:
-        """Return whether the parent asked for an end."""
-        return self._link.should_stop()
+        self._send(Warn(shortened(message)))
 
 
 def main(
@@ -67,7 +70,7 @@ def main(
     runtime = run.config.runtime
     access = Access(address, Path(keys)) if address else None
     with _rollouts(link, endpoint, run_id, runtime.unit_timeout_s, access) as rollouts:
-        context = _Context(link, rollouts, runtime.checkpoint_interval_s)
+        context = Context(link.send, link.should_stop, rollouts, runtime.checkpoint_interval_s)
         try:
             execute(found, run, job, context)
         except JobStoppedError:
