@@ -41,7 +41,11 @@ class Discriminator(nn.Module):
         super().__init__()
         self.config = config
         self.net = MLP(2 * observation_dim, config.hidden, 1, rng)
-        self.optimiser = Adam(list(self.parameters()), config.learning_rate)
+        self.restart_optimiser()
+
+    def restart_optimiser(self) -> None:
+        """Begin with fresh moments, at the configured learning rate."""
+        self.optimiser = Adam(list(self.parameters()), self.config.learning_rate)
 
     def forward(self, pairs: Tensor) -> Tensor:
         """Return (B,) logits of `pairs`; high for demonstrations."""

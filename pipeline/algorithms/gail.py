@@ -79,9 +79,10 @@ class AdversarialReward:
         """Go on with the discriminator alone, against rollouts of a policy that no longer learns.
 
         While both learn, a discriminator is always behind: for a while even an imitator that fails may fool it. Each of
-        the ``steps`` draws ``batch_size`` pairs from either side.
+        the ``steps`` draws ``batch_size`` pairs from either side. The optimiser begins anew: its moments are of a
+        policy that moved, and its steps had shrunk.
         """
-        self.discriminator.optimiser.learning_rate = self.discriminator.config.learning_rate
+        self.discriminator.restart_optimiser()
         policy_pairs = self._policy_pairs(rollouts)
         rng = generator(derive_key(self.root_seed, "discriminator", "settle"))
         for _ in range(steps):
