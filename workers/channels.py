@@ -8,6 +8,7 @@ are bounded, and closing drops what was not sent, so nothing here can hang.
 """
 
 import hashlib
+import logging
 import os
 import shutil
 import stat
@@ -20,7 +21,7 @@ from pathlib import Path
 import zmq
 from zmq.auth.thread import ThreadAuthenticator
 
-from workers.keys import KeyPair, client_keys, server_keys
+from workers.keys import KeyPair, KeysError, client_keys, server_keys
 from workers.messages import MAX_FRAME_BYTES
 
 _QUEUE_LIMIT = 64
@@ -117,10 +118,10 @@ class Router(_Socket):
         self._socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
         self._authenticator: ThreadAuthenticator | None = None
         if access is not None:
-            keys = server_keys(access.keys)
+            own = server_keys(access.keys).own
             # Before the first bind: until somebody answers for the domain, nobody is let in.
-            self._authenticator = _authenticator(self._context, keys.allowed)
-            self._socket.curve_secretkey, self._socket.curve_publickey = keys.own.secret, keys.own.public
+            self._authenticator = _authenticator(self._context, access.keys)
+            self._socket.curve_secretkey, self._socket.curve_publickey = own.secret, own.public
             self._socket.curve_server = True
             self._socket.zap_domain = _DOMAIN.encode()
             self._socket.bind(access.address)
@@ -215,12 +216,16 @@ def check_access(access: Access) -> None:
         context.destroy(linger=0)
 
 
-def _authenticator(context: zmq.Context, allowed: frozenset[bytes]) -> ThreadAuthenticator:
-    """Start the thread that ZeroMQ asks about every peer; only listed keys are let in."""
+def _authenticator(context: zmq.Context, keys: Path) -> ThreadAuthenticator:
+    """Start the thread that ZeroMQ asks about every peer; only keys that are listed at that moment are let in."""
 
     class AllowList:
         def callback(self, domain: str, key: bytes) -> bool:
-            return key in allowed
+            try:
+                return key in server_keys(keys).allowed
+            except KeysError as error:
+                logging.warning("nobody is let in: %s", error)
+                return False
 
     authenticator = ThreadAuthenticator(context)
     authenticator.start()

@@ -1,9 +1,12 @@
 """The engine on a real Ray cluster of two nodes on this machine: the same bits as without, and one node may die."""
 
+import os
+import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 import ray
 from ray.cluster_utils import Cluster
@@ -56,6 +59,22 @@ def test_jobs_go_on_after_whatever_happens_to_them(tmp_path: Path, cluster: Clus
     assert read_artifact(on_ray.directory.job("jobs", "raises")) is None
 
 
+def test_a_job_that_hangs_is_given_up_and_goes_on(tmp_path: Path, cluster: Cluster) -> None:
+    """Its process is stopped in the middle, so that it does not even follow a request to end."""
+    inline, on_ray = fake_run(tmp_path / "inline"), fake_run(tmp_path / "ray", job_timeout_s=4)
+    LocalEngine(0, STAGES).run_jobs(FakeStage(False), inline, ["a"], lambda event: None, lambda: False)
+    events: list[Event] = []
+    try:
+        outcome = RayEngine(STAGES).run_jobs(FakeStage(False), on_ray, ["frozen"], events.append, lambda: False)
+    finally:
+        for pid in lines(on_ray.directory.path / "frozen.attempts")[:1]:
+            os.kill(int(pid), signal.SIGKILL)
+    assert outcome == Outcome(done=["frozen"])
+    assert [e.reason for e in events if isinstance(e, JobFailed)] == ["no progress for 4 s (runtime.job_timeout_s)"]
+    assert lines(on_ray.directory.path / "frozen.began_at") == ["0", "3"]
+    assert on_ray.job_artifact("jobs", "frozen").sha256 == inline.job_artifact("jobs", "a").sha256
+
+
 def test_a_learner_on_ray_stops_and_goes_on(tmp_path: Path, cluster: Cluster) -> None:
     stage, whole, stopped = FakeStage(True), fake_run(tmp_path / "whole"), fake_run(tmp_path / "stopped")
     LocalEngine(0, STAGES).run_jobs(stage, whole, ["a"], lambda event: None, lambda: False)
@@ -69,14 +88,37 @@ def test_a_learner_on_ray_stops_and_goes_on(tmp_path: Path, cluster: Cluster) ->
 
 
 def test_units_give_the_same_bits_on_ray(cluster: Cluster, assert_same_bits) -> None:
-    sources = InlineRollouts(), RayRollouts()
+    sources = InlineRollouts(), RayRollouts(unit_timeout_s=60)
     for source in sources:
         source.submit(hopper_units(3))
     assert_same_bits(*[source.gather() for source in sources])
 
 
+def test_a_unit_whose_process_hangs_is_given_away_again(cluster: Cluster, assert_same_bits) -> None:
+    units = hopper_units(0, count=2, num_steps=20_000)
+    inline, on_ray = InlineRollouts(), RayRollouts(unit_timeout_s=20)
+    on_ray.submit(units)
+    frozen: list[psutil.Process] = []
+
+    def freeze() -> bool:
+        for process in psutil.process_iter(["cmdline"]):
+            if process.info["cmdline"] and process.info["cmdline"][0] == "ray::_collect":
+                process.suspend()
+                frozen.append(process)
+                return True
+        return False
+
+    wait_until(freeze)
+    try:
+        results = on_ray.gather()
+    finally:
+        frozen[0].kill()
+    inline.submit(units)
+    assert_same_bits(results, inline.gather())
+
+
 def test_a_unit_that_raises_says_why(cluster: Cluster) -> None:
-    source = RayRollouts()
+    source = RayRollouts(unit_timeout_s=60)
     source.submit(hopper_units(0, count=1, env_id="oodil/Nowhere-v0"))
     with pytest.raises(ValueError, match="oodil/Nowhere-v0"):
         source.gather()

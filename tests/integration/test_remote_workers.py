@@ -70,6 +70,20 @@ def test_only_a_peer_with_an_allowed_key_is_heard(access: Access, tmp_path: Path
         router.close()
 
 
+def test_keys_are_allowed_and_taken_back_while_a_learner_listens(access: Access, tmp_path: Path) -> None:
+    router = Router(f"ipc://{tmp_path}/s", access)
+    try:
+        keys = create_worker_keys(access.keys, "late", new_key_pair)
+        for is_allowed in (True, False):
+            dealer = Dealer(access.address, "late", keys)
+            dealer.send(hello("late"))
+            assert heard(router, 30.0 if is_allowed else 1.0) == ["late"] * is_allowed
+            dealer.close()
+            (access.keys / "allowed" / "late.public").unlink(missing_ok=True)
+    finally:
+        router.close()
+
+
 def finished(run: Run, engine: LocalEngine) -> str:
     stage = FakeStage(distributed=True)
     outcome = engine.run_jobs(stage, run, ["waits"], lambda _: None, lambda: False)
