@@ -72,7 +72,15 @@ def run_seed(seed: int, config: GailConfig) -> dict[str, Any]:
     policy, _ = load_expert(EXPERT)
     source = EnvironmentConfig(id=ENV_ID, dynamics=DEMONSTRATOR)
     demonstrations, _ = collect_demonstrations(
-        policy, source, "9.8", 10, seed, deterministic=False, full_length_only=True, context=Quiet()
+        policy,
+        source,
+        "9.8",
+        10,
+        seed,
+        deterministic=False,
+        full_length_only=True,
+        minimum_return=None,
+        context=Quiet(),
     )
     reward = AdversarialReward(demonstrations, np.ones(len(demonstrations)), config.discriminator, seed)
     learner = Learner(demonstrations.observation_dim, 3, config, reward, seed)

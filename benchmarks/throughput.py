@@ -64,7 +64,7 @@ class RawPhysics:
 
     def play(self, actions: NDArray[np.float32]) -> float:
         """Apply (T, G, A) actions and return the seconds of computation it took."""
-        model, frame_skip, step = self._batch.model, self._batch.env.frame_skip, mujoco.mj_step
+        model, frame_skip, step = self._batch.model, self._batch.task.frame_skip, mujoco.mj_step
         started = time.process_time()
         for action in actions:
             for data, control, row in zip(self._data, self._controls, action, strict=True):
@@ -86,7 +86,7 @@ def draw_actions(rng: np.random.Generator, action_dim: int) -> NDArray[np.float3
 
 
 def stepping(env_id: str, rounds: int) -> dict[str, Any]:
-    """Compare `MujocoBatch` with bare physics on one core. Raises AssertionError if their states come apart."""
+    """Compare `LocomotionBatch` with bare physics on one core. Raises AssertionError if their states come apart."""
     batch, raw = make_batch(env_id, {}, SIMULATORS), RawPhysics(env_id)
     rng = np.random.default_rng(0)
     batch_rates, raw_rates = [], []

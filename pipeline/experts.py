@@ -8,12 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium
-
 from pipeline.artifacts import Artifact, Checkpoints, Files, encode_arrays, encode_json, read_artifact
 from pipeline.config import EnvironmentConfig, PpoConfig, TrainingConfig, ValueConfig
 from pipeline.data import DataError, Demonstrations, Episode
-from pipeline.environments import make_batch
+from pipeline.environments import Simulators, make_batch
 from pipeline.evaluation import run_episodes
 from pipeline.policy import Controller, GaussianPolicy
 from pipeline.seeding import derive_key, generator
@@ -72,18 +70,16 @@ def load_expert(path: Path) -> tuple[GaussianPolicy, Artifact]:
         raise ExpertError(str(error)) from error
 
 
-def hand_written(environment: EnvironmentConfig) -> Controller:
+def hand_written(simulators: Simulators, env_id: str) -> Controller:
     """Return the controller that an environment brings along. Raises ExpertError if it brings none."""
-    arguments: dict[str, Any] = dict(environment.dynamics)
-    task: Any = gymnasium.make(environment.id, disable_env_checker=True, **arguments).unwrapped
-    if not hasattr(task, "demonstrator"):
-        raise ExpertError(f"{environment.id} brings no hand-written controller; name the folder of a saved expert")
-    controller: Controller = task.demonstrator()
+    if not hasattr(simulators, "demonstrator"):
+        raise ExpertError(f"{env_id} brings no hand-written controller; name the folder of a saved expert")
+    controller: Controller = simulators.demonstrator()
     return controller
 
 
 def collect_demonstrations(
-    controller: Controller,
+    policy: GaussianPolicy | None,
     environment: EnvironmentConfig,
     label: str,
     count: int,
@@ -96,17 +92,18 @@ def collect_demonstrations(
 ) -> tuple[Demonstrations, float]:
     """Collect ``count`` demonstrations and return them with the share of episodes that were kept.
 
-    A hand-written controller does as it does, ``deterministic`` or not.
+    Without a policy, the environment's hand-written controller acts; it does as it does, ``deterministic`` or not.
 
     Raises DataError when fewer than one episode in ten can be kept.
     """
     simulators = make_batch(environment.id, environment.dynamics, COLLECTION_SIMULATORS)
+    controller = policy or hand_written(simulators, environment.id)
     kept: list[Episode] = []
     rounds = 0
     while len(kept) < count:
         rounds += 1
         key = derive_key(seed, "demonstrations", label, rounds)
-        stochastic = isinstance(controller, GaussianPolicy) and not deterministic
+        stochastic = policy is not None and not deterministic
         episodes = run_episodes(simulators, controller, generator(key), stochastic=stochastic)
         if full_length_only:
             episodes = [each for each in episodes if len(each.states) == simulators.max_episode_steps + 1]

@@ -9,19 +9,18 @@ from typing import Any
 
 import gymnasium
 
-from pipeline.environments.batch import MujocoBatch, Simulators, Snapshot
+from pipeline.environments.batch import Simulators, Snapshot
 from pipeline.environments.replay import ReplayBatch, refuse_randomness
 
-MAX_EPISODE_STEPS = 1000
-
-for _id, _class in {
-    "oodil/Hopper-v0": "mujoco:HopperEnv",
-    "oodil/Walker2d-v0": "mujoco:Walker2dEnv",
-    "oodil/HalfCheetah-v0": "mujoco:HalfCheetahEnv",
-    "oodil/Driving-v0": "driving:DrivingEnv",
-}.items():
+for _id, _class, _steps in (
+    ("oodil/Hopper-v0", "locomotion:HopperEnv", 1000),
+    ("oodil/Walker2d-v0", "locomotion:Walker2dEnv", 1000),
+    ("oodil/HalfCheetah-v0", "locomotion:HalfCheetahEnv", 1000),
+    ("oodil/Driving-v0", "driving:DrivingEnv", 1000),
+    ("oodil/Panda-v0", "panda:PandaEnv", 2000),
+):
     if _id not in gymnasium.registry:
-        gymnasium.register(_id, entry_point=f"pipeline.environments.{_class}", max_episode_steps=MAX_EPISODE_STEPS)
+        gymnasium.register(_id, entry_point=f"pipeline.environments.{_class}", max_episode_steps=_steps)
 
 
 def make_batch(env_id: str, dynamics: Mapping[str, float], num_simulators: int) -> Simulators:
@@ -44,8 +43,6 @@ def make_batch(env_id: str, dynamics: Mapping[str, float], num_simulators: int) 
     limit = env.spec.max_episode_steps if env.spec is not None else None
     if limit is None:
         raise ValueError(f"environment {env_id!r} has no time limit; register it with max_episode_steps")
-    if hasattr(task, "healthy_bounds"):
-        return MujocoBatch(task, num_simulators, limit)
     if hasattr(task, "batched"):
         batch: Simulators = task.batched(num_simulators, limit)
         return batch

@@ -168,10 +168,6 @@ class DrivingEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         """Return many cars in this world."""
         return DrivingBatch(self.layout, num_simulators, max_episode_steps)
 
-    def demonstrator(self) -> "Driver":
-        """Return the hand-written driver of this world."""
-        return Driver(self.layout)
-
     def _observation(self) -> Floats:
         x, y, heading = (np.asarray(value) for value in (*self._car.position, self._car.heading))
         return observe(x, y, heading, self.layout.speed)
@@ -230,6 +226,10 @@ class DrivingBatch:
         self._elapsed += 1
         self._returns += rewards
         return StepOutcome(rewards, crashed | outside | reached, self._elapsed >= self.max_episode_steps)
+
+    def demonstrator(self) -> "Driver":
+        """Return the hand-written driver of this world."""
+        return Driver(self.layout)
 
     def _touches(self, box: Box) -> NDArray[np.bool_]:
         """Return (G,) whether each car and the box overlap: they do unless one of four axes lies between them."""

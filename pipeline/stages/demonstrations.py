@@ -10,8 +10,8 @@ from pipeline.artifacts import Files, encode_json
 from pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
 from pipeline.data import DataError, Demonstrations
 from pipeline.datasets import decode_demonstrations, encode_demonstrations, read_demonstrations
+from pipeline.environments import make_batch
 from pipeline.experts import collect_demonstrations, hand_written, load_expert
-from pipeline.policy import Controller
 from pipeline.stage import JobContext, Run, Stage
 
 FILE = "demonstrations.safetensors"
@@ -53,7 +53,7 @@ class DemonstrationsStage(Stage):
         source = section.sources[names.index(job)]
         environment = EnvironmentConfig(id=config.environment.id, dynamics=source.dynamics)
         demonstrations, kept = collect_demonstrations(
-            _controller(source, environment),
+            None if isinstance(source.expert, str) else load_expert(source.expert)[0],
             environment,
             source.label,
             source.count,
@@ -110,7 +110,7 @@ def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
             raise DataError(f"{section.file}: recorded in {environment}, but the run is for {config.environment.id}")
     for source in section.sources:
         if isinstance(source.expert, str):
-            hand_written(EnvironmentConfig(id=config.environment.id, dynamics=source.dynamics))
+            hand_written(make_batch(config.environment.id, source.dynamics, 1), config.environment.id)
             continue
         policy, _ = load_expert(source.expert)
         if len(policy.input_mean) != observation_dim:
@@ -118,10 +118,6 @@ def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
                 f"{source.expert}: the expert sees {len(policy.input_mean)} dimensions; "
                 f"environment {config.environment.id} has {observation_dim}"
             )
-
-
-def _controller(source: SourceConfig, environment: EnvironmentConfig) -> Controller:
-    return hand_written(environment) if isinstance(source.expert, str) else load_expert(source.expert)[0]
 
 
 def _identity(source: SourceConfig) -> str:

@@ -6,7 +6,7 @@ import gymnasium
 import pytest
 
 from pipeline.environments import MAX_EPISODE_STEPS
-from pipeline.environments.mujoco import HopperEnv
+from pipeline.environments.locomotion import HopperEnv
 from pipeline.loading import load_config
 from tests.runs import MICRO, artifacts, run
 

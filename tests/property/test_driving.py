@@ -7,7 +7,6 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.config import EnvironmentConfig
 from pipeline.environments import make_batch
 from pipeline.environments.driving import GOAL, DrivingBatch, DrivingEnv, layout
 from pipeline.evaluation import run_episodes
@@ -88,10 +87,8 @@ def test_a_snapshot_continues_to_the_same_bits() -> None:
 
 @pytest.mark.parametrize("name", SOURCES)
 def test_the_driver_reaches_the_goal_in_its_own_world(name: str) -> None:
-    environment = EnvironmentConfig(id=ID, dynamics=SOURCES[name])
-    episodes = run_episodes(
-        make_batch(ID, SOURCES[name], 60), hand_written(environment), generator((0,)), stochastic=False
-    )
+    cars = make_batch(ID, SOURCES[name], 60)
+    episodes = run_episodes(cars, hand_written(cars, ID), generator((0,)), stochastic=False)
     assert all(episode.env_return > -500 for episode in episodes), "the goal was not reached"
     speeds = {round(float(np.hypot(*episode.states[-1][2:4])), 4) for episode in episodes}
     assert speeds == {SOURCES[name]["speed"]}

@@ -1,8 +1,9 @@
 """Gymnasium's v5 locomotion tasks with their dynamics as keyword arguments.
 
 The observation is ``[qpos, qvel]`` with root x, as the paper's experiments use it. Dynamics are set on the compiled
-model, so no XML is copied. Each class also states what `pipeline.environments.batch` needs to step many of them: its
-health rule for a whole batch, and how it draws the initial velocity.
+model, so no XML is copied. Each class also states what `LocomotionBatch` needs to step many of them: its health rule
+for a whole batch, and how it draws the initial velocity. The batch agrees to the last bit with one Gymnasium
+environment per simulator.
 """
 
 from typing import Any, Protocol
@@ -10,12 +11,15 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import half_cheetah_v5, hopper_v5, walker2d_v5
+from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
+
+from pipeline.environments.batch import MujocoBatch, StepOutcome
 
 Floats = NDArray[np.float64]
 
 
-class BatchedTask(Protocol):
+class Task(Protocol):
     """What a locomotion task says of itself; the names with an underscore are Gymnasium's own."""
 
     model: mujoco.MjModel
@@ -45,7 +49,7 @@ def _uniform_velocity(task: "HopperEnv | Walker2dEnv", rng: np.random.Generator)
     return task.init_qvel + rng.uniform(low=-scale, high=scale, size=task.model.nv)
 
 
-def _no_bounds(task: BatchedTask) -> tuple[Floats, Floats]:
+def _no_bounds(task: Task) -> tuple[Floats, Floats]:
     size = task.model.nq + task.model.nv
     return np.full(size, -np.inf), np.full(size, np.inf)
 
@@ -79,6 +83,10 @@ class HopperEnv(hopper_v5.HopperEnv):
         """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
         return _uniform_velocity(self, rng)
 
+    def batched(self, num_simulators: int, max_episode_steps: int) -> "LocomotionBatch":
+        """Return many robots with these dynamics."""
+        return LocomotionBatch(self, num_simulators, max_episode_steps)
+
 
 class Walker2dEnv(walker2d_v5.Walker2dEnv):
     """Walker2d-v5 with root x in the observation and one sliding ``friction`` for both feet.
@@ -102,6 +110,10 @@ class Walker2dEnv(walker2d_v5.Walker2dEnv):
     def reset_velocity(self, rng: np.random.Generator) -> Floats:
         """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
         return _uniform_velocity(self, rng)
+
+    def batched(self, num_simulators: int, max_episode_steps: int) -> "LocomotionBatch":
+        """Return many robots with these dynamics."""
+        return LocomotionBatch(self, num_simulators, max_episode_steps)
 
 
 class HalfCheetahEnv(half_cheetah_v5.HalfCheetahEnv):
@@ -129,3 +141,68 @@ class HalfCheetahEnv(half_cheetah_v5.HalfCheetahEnv):
     def reset_velocity(self, rng: np.random.Generator) -> Floats:
         """Draw the initial velocity (nv,) exactly as Gymnasium's reset does."""
         return self.init_qvel + self._reset_noise_scale * rng.standard_normal(self.model.nv)
+
+    def batched(self, num_simulators: int, max_episode_steps: int) -> "LocomotionBatch":
+        """Return many robots with these dynamics."""
+        return LocomotionBatch(self, num_simulators, max_episode_steps)
+
+
+class LocomotionBatch(MujocoBatch):
+    """G robots of one task."""
+
+    def __init__(self, task: Task, num_simulators: int, max_episode_steps: int) -> None:
+        super().__init__(task.model, num_simulators, max_episode_steps)
+        self.task = task
+        # Views into MuJoCo's memory, fetched once: every attribute access on MjData costs as much as a copy.
+        self._controls = [data.ctrl for data in self._data]
+        self._positions = [data.qpos for data in self._data]
+        self._velocities = [data.qvel for data in self._data]
+        nq, nv = self.model.nq, self.model.nv
+        self.observation_dim = nq + nv
+        self._states = np.zeros((num_simulators, nq + nv))
+        self._qpos, self._qvel = self._states[:, :nq], self._states[:, nq:]
+        self._healthy_above, self._healthy_below = task.healthy_bounds()
+
+    def observations(self) -> Floats:
+        """Return (G, S) observations of the present states."""
+        states, limit = self._states.copy(), self.task.velocity_limit
+        if limit < np.inf:
+            velocities = states[:, self.model.nq :]
+            np.minimum(np.maximum(velocities, -limit, out=velocities), limit, out=velocities)
+        return states
+
+    def step(self, actions: NDArray[np.floating]) -> StepOutcome:
+        """Apply (G, A) actions for one control step in every simulator."""
+        x_before = self._qpos[:, 0].copy()
+        model, frame_skip, step = self.model, self.task.frame_skip, mujoco.mj_step
+        qpos, qvel = self._qpos, self._qvel
+        for i, data in enumerate(self._data):
+            self._controls[i][:] = actions[i]
+            step(model, data, frame_skip)
+            qpos[i] = self._positions[i]
+            qvel[i] = self._velocities[i]
+        return self._outcome(x_before, actions)
+
+    def _outcome(self, x_before: Floats, actions: NDArray[np.floating]) -> StepOutcome:
+        # The order of the operations follows Gymnasium's, so that the bits do too.
+        task = self.task
+        inside = (self._healthy_above < self._states) & (self._states < self._healthy_below)
+        healthy = np.asarray(inside.all(axis=1))
+        rewards = task._forward_reward_weight * ((self._qpos[:, 0] - x_before) / task.dt)
+        rewards = rewards + healthy * task._healthy_reward
+        rewards = rewards - task._ctrl_cost_weight * np.square(actions).sum(axis=1)
+        terminated = ~healthy & task._terminate_when_unhealthy
+        self._elapsed += 1
+        self._returns += rewards
+        return StepOutcome(rewards, terminated, self._elapsed >= self.max_episode_steps)
+
+    def _start(self, data: mujoco.MjData, seed: int) -> None:
+        rng, _ = np_random(seed)
+        scale = self.task._reset_noise_scale
+        data.qpos[:] = self.task.init_qpos + rng.uniform(low=-scale, high=scale, size=self.model.nq)
+        data.qvel[:] = self.task.reset_velocity(rng)
+        mujoco.mj_forward(self.model, data)
+
+    def _read(self, simulator: int) -> None:
+        self._qpos[simulator] = self._positions[simulator]
+        self._qvel[simulator] = self._velocities[simulator]

@@ -1,0 +1,318 @@
+"""Panda: an arm, some of whose joints are locked, pushes a box along a table (the paper's simulated robot).
+
+Arm, gripper, table and box are robosuite's models, stepped by MuJoCo directly; robosuite's own control loop takes a
+hundred times as long. A locked joint is none at all: its link is fixed to the one before, at the angle of the reset.
+So are the seventh joint and the fingers, always.
+
+Lengths in m, times in s, angles in rad; x ahead of the arm, z up. Letters: G simulators, J working joints.
+"""
+
+import logging
+from functools import lru_cache
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+from gymnasium.utils.seeding import np_random
+from numpy.typing import NDArray
+
+from pipeline.environments.batch import MujocoBatch, StepOutcome
+
+Floats = NDArray[np.float64]
+
+TIME_STEP = 1 / 240
+ALL_JOINTS = (1, 2, 3, 4, 5, 6)
+START_ANGLES = {1: 0.0, 2: -np.pi / 6, 3: 0.0, 4: -3.0, 5: 0.0, 6: 5 * np.pi / 6, 7: np.pi / 4}
+FINGER_POSITION = 0.03
+BOX_START, BOX_SIZE, BOX_MASS = (0.5, 0.0, 0.08), (0.3, 0.2, 0.2), 10.0
+BOX_FRICTION = 0.25
+GOAL_X, GOAL_Z, GOAL_RADIUS = 0.81, 0.05, 0.05
+START_BEFORE_X = 0.4
+SUCCESS_REWARD, FAILURE_REWARD = 1000.0, -1000.0
+SERVO = 1000.0
+"""N m s / rad. The wanted velocity is the distance to the wanted angle, per second, so this is the stiffness, too."""
+_SITE, _BOX_JOINT, _ARM = "gripper0_grip_site", "box_joint0", ("robot0_", "gripper0_")
+
+
+class Arm:
+    """A compiled arm with its table and box, and the rules of the task."""
+
+    def __init__(self, working: tuple[int, ...], spread: float) -> None:
+        self.model = _compile(working)
+        self.working = working
+        self.spread = spread
+        joints = [self.model.joint(_joint_name(n)) for n in working]
+        self.angles = np.array([joint.qposadr[0] for joint in joints])
+        """Where the working joints' angles are in ``qpos``."""
+        self._freedoms = np.array([joint.dofadr[0] for joint in joints])
+        self.low, self.high = np.array([joint.range for joint in joints]).T
+        self._start = np.array([START_ANGLES[n] for n in working])
+        self._site = self.model.site(_SITE).id
+        self._box = self.model.joint(_BOX_JOINT).qposadr[0]
+        bodies = [self.model.body(geom.bodyid[0]).name for geom in map(self.model.geom, range(self.model.ngeom))]
+        self._is_arm = np.array([name.startswith(_ARM) for name in bodies])
+
+    def start(self, data: mujoco.MjData, rng: np.random.Generator) -> None:
+        """Draw angles until the hand is before the box and the arm touches nothing."""
+        data.qpos[self._box : self._box + 7] = (*BOX_START, 1, 0, 0, 0)
+        while True:
+            drawn = self._start + rng.uniform(-self.spread, self.spread, len(self.working))
+            data.qpos[self.angles] = np.clip(drawn, self.low, self.high)
+            mujoco.mj_forward(self.model, data)
+            if self.hand(data)[0] < START_BEFORE_X and not self._is_arm[data.contact.geom].any():
+                break
+        data.ctrl[:] = data.qpos[self.angles]
+
+    def move(self, data: mujoco.MjData, action: NDArray[np.floating]) -> None:
+        """Move the wanted angles by ``action`` (J,) in [-1, 1] rad/s for one control step."""
+        wanted = data.ctrl + np.clip(action, -1, 1) * TIME_STEP
+        data.ctrl[:] = np.minimum(np.maximum(wanted, self.low), self.high)
+        mujoco.mj_step(self.model, data)
+        mujoco.mj_kinematics(self.model, data)
+
+    def hand(self, data: mujoco.MjData) -> Floats:
+        """Return the position (3,) between the fingers."""
+        return np.asarray(data.site_xpos[self._site])
+
+    def jacobian(self, data: mujoco.MjData) -> Floats:
+        """Return (3, J): how fast the hand moves when a joint turns."""
+        whole = np.empty((3, self.model.nv))
+        mujoco.mj_comPos(self.model, data)
+        mujoco.mj_jacSite(self.model, data, whole, None, self._site)
+        return whole[:, self._freedoms]
+
+    def observe(self, data: mujoco.MjData) -> Floats:
+        """Return (6,): where the hand and the box are. Velocities and angles are not observed."""
+        return np.concatenate((self.hand(data), data.qpos[self._box : self._box + 3]))
+
+
+def judge(observations: Floats) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return rewards, successes and failures (G,) for (G, 6) observations."""
+    hand_x, box = observations[:, 0], observations[:, 3:]
+    reached = np.hypot(box[:, 0] - GOAL_X, box[:, 2] - GOAL_Z) < GOAL_RADIUS
+    lost = (hand_x - box[:, 0] > 0.5) | (box[:, 2] < -0.1) | (np.abs(box) > 1).any(axis=1)
+    lost &= ~reached
+    return box[:, 0] - BOX_START[0] + SUCCESS_REWARD * reached + FAILURE_REWARD * lost, reached, lost
+
+
+class PandaEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
+    """One arm; of ``joint_1`` to ``joint_6`` each works (1) or is locked (0); starts vary by ``spread`` rad."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 240}  # noqa: RUF012  (Gymnasium's own form)
+
+    def __init__(
+        self,
+        joint_1: float = 1,
+        joint_2: float = 1,
+        joint_3: float = 1,
+        joint_4: float = 1,
+        joint_5: float = 1,
+        joint_6: float = 1,
+        spread: float = 0.2,
+        render_mode: str | None = None,
+    ) -> None:
+        states = dict(zip(ALL_JOINTS, (joint_1, joint_2, joint_3, joint_4, joint_5, joint_6), strict=True))
+        for number, state in states.items():
+            if state not in (0, 1):
+                raise ValueError(f"joint_{number} is {state}; a joint works (1) or is locked (0)")
+        if not any(states.values()):
+            raise ValueError("every joint is locked; at least one of joint_1 to joint_6 must be 1")
+        if not 0 <= spread <= np.pi:
+            raise ValueError(f"spread is {spread}; it must be between 0 and pi (rad)")
+        self.arm = Arm(tuple(number for number, state in states.items() if state), spread)
+        self.render_mode = render_mode
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(self.arm.working),), np.float32)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (6,), np.float64)
+        self._data = mujoco.MjData(self.arm.model)
+        self._renderer: mujoco.Renderer | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+        """Put the box on the table and the hand before it."""
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.arm.model, self._data)
+        self.arm.start(self._data, self.np_random)
+        return self.arm.observe(self._data), {}
+
+    def step(self, action: NDArray[np.floating]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        """Move for one control step."""
+        self.arm.move(self._data, np.asarray(action))
+        observation = self.arm.observe(self._data)
+        (reward,), (reached,), (lost,) = judge(observation[None])
+        return observation, float(reward), bool(reached or lost), False, {"is_success": bool(reached)}
+
+    def render(self) -> NDArray[np.uint8]:
+        """Return the scene from the side (height, width, 3)."""
+        if self._renderer is None:
+            self._renderer = mujoco.Renderer(self.arm.model, 480, 640)
+        camera = mujoco.MjvCamera()
+        camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (0.4, 0.0, 0.25), 1.8, 120, -20
+        shown = mujoco.MjvOption()
+        # robosuite keeps what collides in group 0, what is looked at in group 1, and marks in sites.
+        shown.geomgroup[0], shown.sitegroup[:] = 0, 0
+        self._renderer.update_scene(self._data, camera, shown)
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Free what rendering took."""
+        if self._renderer is not None:
+            self._renderer.close()
+
+    def batched(self, num_simulators: int, max_episode_steps: int) -> "PandaBatch":
+        """Return many such arms."""
+        return PandaBatch(self.arm, num_simulators, max_episode_steps)
+
+
+class PandaBatch(MujocoBatch):
+    """G arms with the same joints."""
+
+    observation_dim = 6
+
+    def __init__(self, arm: Arm, num_simulators: int, max_episode_steps: int) -> None:
+        super().__init__(arm.model, num_simulators, max_episode_steps)
+        self.arm = arm
+        self._observations = np.zeros((num_simulators, 6))
+
+    def observations(self) -> Floats:
+        """Return (G, 6) observations of the present states."""
+        return self._observations.copy()
+
+    def step(self, actions: NDArray[np.floating]) -> StepOutcome:
+        """Apply (G, J) actions for one control step in every simulator."""
+        for i, data in enumerate(self._data):
+            self.arm.move(data, actions[i])
+            self._observations[i] = self.arm.observe(data)
+        rewards, reached, lost = judge(self._observations)
+        self._elapsed += 1
+        self._returns += rewards
+        return StepOutcome(rewards, reached | lost, self._elapsed >= self.max_episode_steps)
+
+    def demonstrator(self) -> "Pusher":
+        """Return the hand-written demonstrator of these arms."""
+        return Pusher(self)
+
+    def kinematics(self, simulator: int) -> tuple[Floats, Floats, Floats]:
+        """Return the Jacobian (3, J) of a simulator's hand, its angles (J,) and the wanted ones (J,)."""
+        data = self._data[simulator]
+        return self.arm.jacobian(data), data.qpos[self.arm.angles].copy(), data.ctrl.copy()
+
+    def _start(self, data: mujoco.MjData, seed: int) -> None:
+        self.arm.start(data, np_random(seed)[0])
+
+    def _read(self, simulator: int) -> None:
+        data = self._data[simulator]
+        mujoco.mj_kinematics(self.model, data)
+        self._observations[simulator] = self.arm.observe(data)
+
+
+class Pusher:
+    """The hand-written demonstrator: bring the hand behind the box, to its height, and then into it.
+
+    It knows the joints that its arm has, so arms with other joints move the hand in other ways.
+    """
+
+    INTO, BEHIND = 0.1, 0.3
+    ALIGNED = 0.05
+    GAIN, MAX_SPEED = 3.0, 0.4
+    DAMPING = 1e-3
+
+    def __init__(self, batch: PandaBatch) -> None:
+        self._batch = batch
+
+    def mean(self, observations: Floats) -> NDArray[np.float32]:
+        """Return (G, J) actions for (G, 6) observations of the batch as it stands."""
+        return np.array([self._act(i, *np.split(row, 2)) for i, row in enumerate(observations)], np.float32)
+
+    def _act(self, simulator: int, hand: Floats, box: Floats) -> Floats:
+        is_aligned = (np.abs(box - hand)[1:] < self.ALIGNED).all()
+        goal = box - (self.INTO if is_aligned else self.BEHIND, 0.0, 0.0)
+        velocity = self.GAIN * (goal - hand)
+        velocity *= min(1.0, self.MAX_SPEED / max(float(np.linalg.norm(velocity)), 1e-9))
+        jacobian, angles, wanted = self._batch.kinematics(simulator)
+        # Damped least squares: https://en.wikipedia.org/wiki/Inverse_kinematics
+        turning = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + self.DAMPING * np.eye(3), velocity)
+        # The servos turn a joint by its distance to the wanted angle, per second.
+        return np.clip((angles + turning - wanted) / TIME_STEP, -1, 1)
+
+
+def _joint_name(number: int) -> str:
+    return f"robot0_joint{number}"
+
+
+@lru_cache(maxsize=8)
+def _compile(working: tuple[int, ...]) -> mujoco.MjModel:
+    """Compile robosuite's arm, gripper, table and box with velocity servos at the working joints."""
+    spec = mujoco.MjSpec.from_string(_assembled())
+    spec.option.timestep = TIME_STEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    limits = {actuator.target: actuator.ctrlrange.copy() for actuator in spec.actuators}
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    for body in spec.bodies:
+        if body.name.startswith(_ARM):
+            # Gravity is compensated, as an arm's own controller does.
+            body.gravcomp = 1.0
+            for geom in body.geoms:
+                if geom.contype or geom.conaffinity:
+                    # It meets box and table, not itself: a link that is fixed to the base would touch its neighbour.
+                    geom.contype, geom.conaffinity = 2, 1
+            for joint in list(body.joints):
+                if joint.name not in map(_joint_name, working):
+                    _lock(spec, body, joint)
+    box = spec.geom("box_g0")
+    # With a higher priority than any other geom, the box alone decides on the friction of its contacts.
+    box.priority, box.friction[0] = 1, BOX_FRICTION
+    for name in ("box_g0", "table_collision", "floor"):
+        spec.geom(name).contype, spec.geom(name).conaffinity = 1, 3
+    spec.geom("floor").pos[2] = -0.65
+    for number in working:
+        name = _joint_name(number)
+        spec.add_actuator(
+            name=name,
+            target=name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            gainprm=[SERVO] + [0.0] * 9,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            biasprm=[0.0, -SERVO, -SERVO] + [0.0] * 7,
+            forcelimited=True,
+            forcerange=limits[name],
+        )
+    return spec.compile()
+
+
+def _lock(spec: mujoco.MjSpec, body: Any, joint: Any) -> None:
+    """Fix a body to its parent, where the joint would hold it at the reset."""
+    if joint.type == mujoco.mjtJoint.mjJNT_SLIDE:
+        side = 1 if joint.range[1] > 0 else -1
+        move = np.empty(3)
+        mujoco.mju_rotVecQuat(move, side * FINGER_POSITION * np.asarray(joint.axis), np.asarray(body.quat))
+        body.pos = np.asarray(body.pos) + move
+    else:
+        turn, turned = np.empty(4), np.empty(4)
+        mujoco.mju_axisAngle2Quat(turn, np.asarray(joint.axis), START_ANGLES[int(joint.name[-1])])
+        mujoco.mju_mulQuat(turned, np.asarray(body.quat), turn)
+        body.quat = turned
+    spec.delete(joint)
+
+
+@lru_cache(maxsize=1)
+def _assembled() -> str:
+    """Return the XML of robosuite's models put together. Raises ImportError when robosuite is not installed."""
+    # It warns of everything that it could have besides.
+    logging.disable(logging.WARNING)
+    try:
+        from robosuite.models.arenas import TableArena
+        from robosuite.models.grippers import PandaGripper
+        from robosuite.models.objects import BoxObject
+        from robosuite.models.robots import Panda
+        from robosuite.models.tasks import ManipulationTask
+
+        arena = TableArena((1.5, 1.0, 0.05), table_offset=(0.5, 0, BOX_START[2] - BOX_SIZE[2] / 2), has_legs=False)
+        robot = Panda()
+        robot.add_gripper(PandaGripper())
+        density = BOX_MASS / float(np.prod(BOX_SIZE))
+        box = BoxObject("box", size=[side / 2 for side in BOX_SIZE], density=density, rgba=(0.85, 0.45, 0.2, 1))
+        xml: str = ManipulationTask(mujoco_arena=arena, mujoco_robots=[robot], mujoco_objects=[box]).get_xml()
+        return xml
+    finally:
+        logging.disable(logging.NOTSET)
