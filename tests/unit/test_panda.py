@@ -100,10 +100,11 @@ def test_the_servo_turns_a_joint_by_its_distance_to_the_wanted_angle() -> None:
     data = mujoco.MjData(arm.model)
     arm.start(data, np.random.default_rng(0))
     begin = data.qpos[arm.angles].copy()
-    data.ctrl[:] = begin + [-0.1, 0.1, 0.1, -0.1]
+    step = np.array([-0.1, 0.1, 0.1, -0.1])
+    data.ctrl[:] = begin + step
     for _ in range(240):
         arm.move(data, np.zeros(4))
-    done = (data.qpos[arm.angles] - begin) / [-0.1, 0.1, 0.1, -0.1]
+    done = (data.qpos[arm.angles] - begin) / step
     np.testing.assert_allclose(done, 1 - np.exp(-1), rtol=0.02)
 
 
