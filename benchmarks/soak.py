@@ -32,16 +32,17 @@ def resident_megabytes(root: psutil.Process) -> dict[str, float]:
     found = {}
     for process in [root, *root.children(recursive=True)]:
         try:
-            found[f"{role(process)} {process.pid}"] = process.memory_info().rss / 1e6
+            name = "orchestrator" if process == root else role(process)
+            found[f"{name} {process.pid}"] = process.memory_info().rss / 1e6
         except psutil.NoSuchProcess:
             continue
     return found
 
 
 def role(process: psutil.Process) -> str:
-    """Return what a child is, by the log it writes; the parent has none."""
-    logs = [Path(file.path).name for file in process.open_files() if file.path.endswith(".log")]
-    return logs[0].rsplit(".", 2)[0] if logs else "orchestrator"
+    """Return what a child is, by the log it writes; multiprocessing's own helper has none."""
+    logs = [Path(file.path).name for file in process.open_files() if "/logs/" in file.path]
+    return logs[0].rsplit(".", 2)[0] if logs else "resource tracker"
 
 
 def growth(minutes: list[float], megabytes: list[float]) -> float:
