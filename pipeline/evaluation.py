@@ -19,7 +19,7 @@ from pipeline.policy import Controller, GaussianPolicy
 from pipeline.seeding import Key, generator
 
 FILM_EVERY = 4
-"""Steps between frames; the environments run at 125 and 20 steps per second of simulated time."""
+"""Steps between frames; the environments run at 10 to 240 steps per second of simulated time."""
 
 
 @dataclass(frozen=True)
