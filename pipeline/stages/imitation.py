@@ -12,7 +12,7 @@ from pipeline.environments import make_batch
 from pipeline.evaluation import evaluate
 from pipeline.seeding import derive_key, torch_seed
 from pipeline.stage import JobContext, Run, Stage
-from pipeline.stages.demonstrations import load_demonstrations, transferable_mask
+from pipeline.stages.demonstrations import load_demonstrations
 
 
 class ImitationStage(Stage):
@@ -104,8 +104,6 @@ class OracleStage(ImitationStage):
     inputs = ("demonstrations",)
 
     def weights(self, run: Run, demonstrations: Demonstrations) -> NDArray[np.float64]:
-        """Return one for the marked demonstrations and zero for all others."""
-        marked = transferable_mask(run.config, demonstrations)
-        if marked is None:
-            raise ValueError("the oracle needs every source marked transferable: true or false")
-        return marked.astype(np.float64)
+        """Return one for demonstrations of a source that is marked transferable, zero for all others."""
+        marks = [float(source.transferable is True) for source in run.config.demonstrations.sources]
+        return np.array(marks)[demonstrations.sources]
