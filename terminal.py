@@ -170,7 +170,9 @@ def print_summary(results: dict[str, float], report: Path) -> None:
 def _figure(name: str, value: float) -> str:
     if name == "seconds":
         return _duration(value)
-    return f"{value:,.0f}" if name == "env_steps" or name.endswith("return") else f"{value:.3f}"
+    if name == "env_steps" or name.endswith("return"):
+        return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return f"{value:.3f}"
 
 
 def print_status(described: dict[str, Any]) -> None:

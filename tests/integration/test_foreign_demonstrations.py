@@ -7,7 +7,6 @@ import pickle
 from collections.abc import Callable
 from pathlib import Path
 
-import gymnasium
 import h5py
 import minari
 import numpy as np
@@ -20,6 +19,7 @@ from pipeline.data import DataError, Demonstrations, Episode
 from pipeline.datasets import read_demonstrations
 from pipeline.datasets.export import export
 from pipeline.datasets.foreign import read_foreign
+from tests.minari_sets import save_minari
 
 HOPPER = "oodil/Hopper-v0"
 LENGTHS = (5, 9, 7)
@@ -46,18 +46,7 @@ def minari_id(states: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.Monk
         )
         for n, s in enumerate(states)
     ]
-    minari.create_dataset_from_buffers(
-        "mine/hopper-v0",
-        episodes,
-        env="Hopper-v5",
-        observation_space=gymnasium.spaces.Box(-np.inf, np.inf, (12,), np.float32),
-        action_space=gymnasium.spaces.Box(-1, 1, (3,), np.float32),
-        algorithm_name="test",
-        author="test",
-        author_email="test@example.org",
-        code_permalink="https://example.org",
-        description="test",
-    )
+    save_minari("mine/hopper-v0", episodes)
     return "minari:mine/hopper-v0"
 
 

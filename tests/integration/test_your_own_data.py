@@ -8,7 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import gymnasium
 import minari
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from minari.data_collector import EpisodeBuffer
 from safetensors.numpy import load_file
 
 from pipeline.environments import make_batch
+from tests.minari_sets import save_minari
 from tests.runs import ROOT
 
 pytestmark = pytest.mark.timeout(300)
@@ -50,18 +50,7 @@ def make_data_set() -> None:
                 truncations=ends,
             )
         )
-    minari.create_dataset_from_buffers(
-        DATA_SET,
-        buffers,
-        env="Hopper-v5",
-        observation_space=gymnasium.spaces.Box(-np.inf, np.inf, (12,), np.float32),
-        action_space=gymnasium.spaces.Box(-1, 1, (3,), np.float32),
-        algorithm_name="test",
-        author="test",
-        author_email="test@example.org",
-        code_permalink="https://example.org",
-        description="test",
-    )
+    save_minari(DATA_SET, buffers)
 
 
 def test_the_walk_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
