@@ -73,7 +73,7 @@ def main() -> None:
             print(f"{minute:5.1f} min  {told}", flush=True)
             time.sleep(min(60.0, arguments.minutes * 6))
         run.terminate()
-        run.wait(timeout=60)
+        run.wait(timeout=600)
     judged: dict[str, Any] = {}
     for name, points in seen.items():
         late = [(minute, megabytes) for minute, megabytes in points if minute > WARM_UP * arguments.minutes]
