@@ -13,7 +13,7 @@ pytestmark = pytest.mark.timeout(300)
 
 @pytest.mark.parametrize("config", sorted((ROOT / "configs" / "quick").glob("*.yaml")), ids=lambda path: path.stem)
 def test_a_quick_run(config: Path, tmp_path: Path) -> None:
-    command = ("run", str(config), "--run-dir", str(tmp_path / "run"), "--workers", "2")
+    command = ("run", str(config), "--run-dir", str(tmp_path / "run"), "--workers", "0")
     run(*command)
     before = artifacts(tmp_path / "run")
     results = json.loads(run("status", str(tmp_path / "run"), "--json"))["results"]
