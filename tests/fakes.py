@@ -61,8 +61,8 @@ class FakeStage(Stage):
     """Each iteration it collects and adds up; a job's name says what else happens to it.
 
     ``raises`` raises in every attempt from its second iteration on, ``killed`` kills its own process once, in the
-    middle, ``frozen`` stops its own process once, and ``waits`` does not end before the file ``go`` is in the run
-    directory.
+    middle, ``frozen`` stops its own process once, ``hangs`` sleeps for an hour once, and ``waits`` does not end before
+    the file ``go`` is in the run directory.
     """
 
     version = 1
@@ -100,6 +100,8 @@ class FakeStage(Stage):
             first = len(lines(folder / f"{job}.attempts")) == 1
             if job in ("killed", "frozen") and iteration == 3 and first:
                 os.kill(os.getpid(), signal.SIGKILL if job == "killed" else signal.SIGSTOP)
+            if job == "hangs" and iteration == 3 and first:
+                time.sleep(3600)
             while job == "waits" and iteration == 2 and not (folder / "go").exists() and not context.should_stop():
                 time.sleep(0.01)
             if context.should_stop():

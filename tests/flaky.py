@@ -1,4 +1,4 @@
-"""A pendulum that misbehaves now and then in child processes, as told by files: each is one misdeed, done once."""
+"""Pendulums that misbehave, as told by files: each file is one misdeed, done once."""
 
 import multiprocessing
 import os
@@ -25,7 +25,7 @@ def allow(folder: Path, number: int) -> None:
 
 
 class FlakyPendulum(PendulumEnv):
-    """Pendulum-v1 with misdeeds that are not drawn from its seed."""
+    """Pendulum-v1 with misdeeds now and then in child processes, not drawn from its seed."""
 
     def step(self, u: Any) -> Any:
         misdeed = self._misdeed()
@@ -52,4 +52,16 @@ class FlakyPendulum(PendulumEnv):
         return ""
 
 
+class StallingPendulum(PendulumEnv):
+    """Pendulum-v1 that stalls in its first step while the file ``stalls`` is there."""
+
+    def step(self, u: Any) -> Any:
+        try:
+            (Path(os.environ[FOLDER_VARIABLE]) / "stalls").unlink()
+        except FileNotFoundError:
+            return super().step(u)
+        time.sleep(3600)
+
+
+gymnasium.register("StallingPendulum-v0", entry_point=StallingPendulum, max_episode_steps=200)
 gymnasium.register("FlakyPendulum-v0", entry_point=FlakyPendulum, max_episode_steps=200)

@@ -1,17 +1,19 @@
 """The engine on a Ray cluster: cluster jobs, the learner and every unit of work are Ray tasks.
 
-Placing tasks, moving bytes and running again what was lost is Ray's. What travels are texts, numbers and the frames of
-`workers.messages`. The run's folder has to be on storage that every node sees under the same path, and every node has
-the same oodil installed.
+Placing tasks, moving bytes and running again what was lost is Ray's. Ray does not see that a task hangs, so a task
+whose time is up ends its own process, and with that it is lost like any other. What travels are texts, numbers and the
+frames of `workers.messages`. The run's folder has to be on storage that every node sees under the same path, and every
+node has the same oodil installed.
 """
 
+import faulthandler
 import ipaddress
-import math
 import os
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +21,18 @@ import ray
 from ray.util import get_node_ip_address
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from pipeline.config import RuntimeConfig
 from pipeline.loading import ConfigError
 from pipeline.rollout import InlineRollouts, Unit, UnitResult, collect
 from pipeline.stage import JobStoppedError, Run, Stage
 from pipeline.versions import collecting_versions
 from workers import job as job_process
-from workers.engine import JobDone, JobFailed, JobProgress, JobStarted, JobWarning, OnEvent, Outcome
+from workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, JobWarning, OnEvent, Outcome
 from workers.messages import Header, ResultMessage, UnitMessage, decode, encode
 from workers.reports import Failed, Progress, Report, Warn, decode_report, encode_report
 from workers.wire import MessageError, shortened
 
 _POLL_S = 0.2
+_LOST = "its process or its node is gone; Ray runs it again"
 _HEADER = Header("", "", "ray", 0)
 """Ray knows which answer belongs to which question."""
 _ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
@@ -90,114 +92,86 @@ class RayEngine:
         """
         path = str(run.directory.path.absolute())
         _check_nodes(path)
+        runtime = run.config.runtime
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
         board: Any = ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here).remote()
-        task = ray.remote(_run_job).options(max_retries=0)
-
-        def start(job: str) -> Any:
-            return task.remote(board, path, self._stages, stage.name, job)
-
+        task = ray.remote(_run_job).options(max_retries=runtime.max_attempts - 1, retry_exceptions=True)
+        running = {task.remote(board, path, self._stages, stage.name, job): job for job in jobs}
+        reader = _Reader(runtime.max_attempts, on_event)
+        outcome = Outcome()
         try:
-            return _Tasks(start, board, run.config.runtime, jobs, on_event).run(should_stop)
+            while running:
+                if should_stop() and not outcome.stopped:
+                    outcome.stopped = True
+                    ray.get(board.stop.remote())
+                ended, _ = ray.wait(list(running), timeout=_POLL_S)
+                reader.take_in(ray.get(board.read.remote()))
+                for reference in ended:
+                    self._take_out(running.pop(reference), reference, reader, outcome)
         finally:
+            for reference in running:
+                ray.cancel(reference, force=True)
             ray.kill(board)
+        outcome.done.sort(key=jobs.index)
+        return outcome
 
-
-class _Tasks:
-    """The jobs of one stage while they run as Ray tasks."""
-
-    def __init__(
-        self, start: Callable[[str], Any], board: Any, runtime: RuntimeConfig, jobs: list[str], on_event: OnEvent
-    ) -> None:
-        self._start = start
-        self._board = board
-        self._runtime = runtime
-        self._jobs = jobs
-        self._on_event = on_event
-        self._running: dict[Any, str] = {}
-        self._attempts: Counter[str] = Counter()
-        self._last_sign: dict[str, float] = {}
-        """When each job that Ray has begun to run began or reported progress."""
-        self._words: dict[str, str] = {}
-        """Why the present attempt ends, from itself."""
-        self._first_reason: dict[str, str] = {}
-        self._outcome = Outcome()
-
-    def run(self, should_stop: Callable[[], bool]) -> Outcome:
-        """Run until nothing is left to run."""
-        for job in self._jobs:
-            self._begin(job)
+    def _take_out(self, job: str, reference: Any, reader: "_Reader", outcome: Outcome) -> None:
         try:
-            while self._running:
-                if should_stop() and not self._outcome.stopped:
-                    self._outcome.stopped = True
-                    ray.get(self._board.stop.remote())
-                ended, _ = ray.wait(list(self._running), timeout=_POLL_S)
-                for job, content in ray.get(self._board.read.remote()):
-                    self._take_in(job, decode_report(content) if content else None)
-                for task in ended:
-                    self._take_out(task)
-                self._give_up_hung_tasks()
-        finally:
-            for task in self._running:
-                ray.cancel(task, force=True)
-        self._outcome.done.sort(key=self._jobs.index)
-        return self._outcome
-
-    def _begin(self, job: str) -> None:
-        self._attempts[job] += 1
-        self._running[self._start(job)] = job
-
-    def _take_in(self, job: str, report: Report | None) -> None:
-        if isinstance(report, Failed):
-            self._words[job] = report.traceback
-        elif isinstance(report, Warn):
-            self._on_event(JobWarning(job, report.text))
-        else:
-            self._last_sign[job] = time.monotonic()
-            if isinstance(report, Progress):
-                self._on_event(JobProgress(job, report.done, report.total, report.metrics))
-            else:
-                self._on_event(JobStarted(job, self._attempts[job]))
-
-    def _take_out(self, task: Any) -> None:
-        job = self._running[task]
-        try:
-            ended = ray.get(task)
+            ended = ray.get(reference)
         except ray.exceptions.RayError as error:
-            self._failed(task, self._words.pop(job, f"its process or its node is gone: {error}"))
-            return
-        self._forget(task)
-        if ended == job_process.DONE:
-            self._outcome.done.append(job)
-            self._on_event(JobDone(job))
+            outcome.failed[job] = reader.first_reason(job) or str(error)
+            reader.lost_for_good(job)
         else:
-            self._outcome.not_run.append(job)
+            if ended == job_process.DONE:
+                outcome.done.append(job)
+                reader.done(job)
+            else:
+                outcome.not_run.append(job)
 
-    def _give_up_hung_tasks(self) -> None:
-        """Leave tasks that have made no progress for too long; a frozen process may not even follow the cancelling."""
-        timeout_s = self._runtime.job_timeout_s
-        for task, job in list(self._running.items()):
-            if time.monotonic() - self._last_sign.get(job, math.inf) > timeout_s:
-                ray.cancel(task, force=True)
-                self._failed(task, f"no progress for {timeout_s:g} s (runtime.job_timeout_s)")
 
-    def _failed(self, task: Any, reason: str) -> None:
-        job = self._forget(task)
-        first = self._first_reason.setdefault(job, reason)
-        tries_again = self._attempts[job] < self._runtime.max_attempts and not self._outcome.stopped
-        self._on_event(JobFailed(job, self._attempts[job], tries_again, reason))
-        if tries_again:
-            self._begin(job)
-        elif self._outcome.stopped:
-            self._outcome.not_run.append(job)
-        else:
-            self._outcome.failed[job] = first
+class _Reader:
+    """Turns what jobs wrote on the board into the engine's events."""
 
-    def _forget(self, task: Any) -> str:
-        job = self._running.pop(task)
-        self._last_sign.pop(job, None)
-        return job
+    def __init__(self, max_attempts: int, on_event: OnEvent) -> None:
+        self._max_attempts = max_attempts
+        self._on_event = on_event
+        self._attempts: Counter[str] = Counter()
+        self._failures: Counter[str] = Counter()
+        self._first_reason: dict[str, str] = {}
+
+    def take_in(self, notes: list[tuple[str, bytes]]) -> None:
+        for job, content in notes:
+            for event in self._events(job, decode_report(content) if content else None):
+                self._on_event(event)
+
+    def first_reason(self, job: str) -> str:
+        return self._first_reason.get(job, "")
+
+    def lost_for_good(self, job: str) -> None:
+        """The last attempt is over; say so unless it did itself."""
+        if self._failures[job] < self._attempts[job]:
+            self._on_event(self._failed(job, _LOST))
+
+    def done(self, job: str) -> None:
+        self._on_event(JobDone(job))
+
+    def _events(self, job: str, report: Report | None) -> list[Event]:
+        if report is None:
+            gone = [self._failed(job, _LOST)] if self._failures[job] < self._attempts[job] else []
+            self._attempts[job] += 1
+            return [*gone, JobStarted(job, self._attempts[job])]
+        if isinstance(report, Progress):
+            return [JobProgress(job, report.done, report.total, report.metrics)]
+        if isinstance(report, Warn):
+            return [JobWarning(job, report.text)]
+        if isinstance(report, Failed):
+            return [self._failed(job, report.traceback)]
+        raise MessageError(f"a job says nothing like {type(report).__name__}")
+
+    def _failed(self, job: str, reason: str) -> JobFailed:
+        self._failures[job] = self._attempts[job]
+        self._first_reason.setdefault(job, reason)
+        return JobFailed(job, self._attempts[job], self._attempts[job] < self._max_attempts, reason)
 
 
 class _Board:
@@ -228,9 +202,10 @@ class _Board:
 class _Writer:
     """A job's end of the board."""
 
-    def __init__(self, board: Any, job: str) -> None:
+    def __init__(self, board: Any, job: str, set_back: Callable[[], None]) -> None:
         self._board = board
         self._job = job
+        self._set_back = set_back
         self._next_question = 0.0
         self._is_stopping = False
 
@@ -239,7 +214,8 @@ class _Writer:
         ray.get(self._board.write.remote(self._job, b""))
 
     def send(self, report: Report) -> None:
-        """Put a report on the board."""
+        """Put a report on the board; the clock that ends a hanging task begins again."""
+        self._set_back()
         ray.get(self._board.write.remote(self._job, encode_report(report)))
 
     def should_stop(self) -> bool:
@@ -250,23 +226,39 @@ class _Writer:
         return self._is_stopping
 
 
+@contextmanager
+def _ended_after(timeout_s: float) -> Iterator[Callable[[], None]]:
+    """End this process after a time, by a thread that no simulator can hold up; what is yielded sets the clock back."""
+
+    def set_back() -> None:
+        faulthandler.dump_traceback_later(timeout_s, exit=True)
+
+    set_back()
+    try:
+        yield set_back
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
 def _run_job(board: Any, run_path: str, stages: str, stage_name: str, job: str) -> str:
     """The task of a job; returns DONE or STOPPED."""
     stage, run = job_process.find(run_path, stages, stage_name)
-    rollouts = RayRollouts(run.config.runtime.unit_timeout_s) if stage.distributed else InlineRollouts()
-    writer = _Writer(board, job)
-    context = job_process.Context(writer.send, writer.should_stop, rollouts, run.config.runtime.checkpoint_interval_s)
-    if writer.should_stop():
-        return job_process.STOPPED
-    writer.begin()
-    try:
-        job_process.execute(stage, run, job, context)
-    except JobStoppedError:
-        return job_process.STOPPED
-    except Exception:
-        writer.send(Failed(shortened(traceback.format_exc())))
-        raise
-    return job_process.DONE
+    runtime = run.config.runtime
+    rollouts = RayRollouts(runtime.unit_timeout_s) if stage.distributed else InlineRollouts()
+    with _ended_after(runtime.job_timeout_s) as set_back:
+        writer = _Writer(board, job, set_back)
+        context = job_process.Context(writer.send, writer.should_stop, rollouts, runtime.checkpoint_interval_s)
+        if writer.should_stop():
+            return job_process.STOPPED
+        writer.begin()
+        try:
+            job_process.execute(stage, run, job, context)
+        except JobStoppedError:
+            return job_process.STOPPED
+        except Exception:
+            writer.send(Failed(shortened(traceback.format_exc())))
+            raise
+        return job_process.DONE
 
 
 class RayRollouts:
@@ -276,24 +268,17 @@ class RayRollouts:
         self._unit_timeout_s = unit_timeout_s
         self._collect = ray.remote(_collect).options(max_retries=-1)
         self._versions = collecting_versions()
-        self._units: list[list[bytes]] = []
         self._answers: list[Any] = []
 
     def submit(self, units: list[Unit]) -> None:
         """Hand over the units of one iteration."""
-        self._units = [encode(UnitMessage(_HEADER, unit)) for unit in units]
-        self._answers = [self._ask(unit) for unit in self._units]
+        self._answers = [
+            self._collect.remote(self._versions, encode(UnitMessage(_HEADER, unit)), self._unit_timeout_s)
+            for unit in units
+        ]
 
     def gather(self) -> list[UnitResult]:
-        """Wait for the submitted units and return their results in group order; raises what collecting raised.
-
-        A unit that takes longer than the time allowed is given away again.
-        """
-        while late := ray.wait(self._answers, num_returns=len(self._answers), timeout=self._unit_timeout_s)[1]:
-            for answer in late:
-                ray.cancel(answer, force=True)
-                group = self._answers.index(answer)
-                self._answers[group] = self._ask(self._units[group])
+        """Wait for the submitted units and return their results in group order; raises what collecting raised."""
         results = []
         for frames in ray.get(self._answers):
             message = decode(frames)
@@ -302,17 +287,15 @@ class RayRollouts:
             results.append(message.result)
         return results
 
-    def _ask(self, unit: list[bytes]) -> Any:
-        return self._collect.remote(self._versions, unit)
 
-
-def _collect(versions: str, frames: list[bytes]) -> list[bytes]:
+def _collect(versions: str, frames: list[bytes], timeout_s: float) -> list[bytes]:
     """The task of a unit: the frames of a UnitMessage in, those of a ResultMessage out."""
     _refuse_other_versions(versions)
     message = decode(frames)
     if not isinstance(message, UnitMessage):
         raise MessageError(f"asked to collect {type(message).__name__}")
-    return encode(ResultMessage(_HEADER, collect(message.unit)))
+    with _ended_after(timeout_s):
+        return encode(ResultMessage(_HEADER, collect(message.unit)))
 
 
 def _check_nodes(run_path: str) -> None:
