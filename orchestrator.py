@@ -16,7 +16,6 @@ import typer
 if TYPE_CHECKING:
     from pipeline.config import RunConfig
     from pipeline.stage import Run, Stage
-    from workers.channels import Access
     from workers.engine import Engine
 
 # Before NumPy and torch are loaded: one compute thread per process, so that the bits do not depend on the machine.
@@ -318,12 +317,15 @@ def _engine(
 ) -> "Engine":
     """Return where jobs run; refuse options that belong to another engine."""
     if name == "local":
+        from workers.channels import open_access
         from workers.engine import LocalEngine
 
         if trust_cluster:
             raise ValueError("--trust-cluster belongs to --engine ray")
-        access = _access(bind, keys, workers)
-        return LocalEngine(config.runtime.workers if workers is None else workers, access=access)
+        count = config.runtime.workers if workers is None else workers
+        if bind is not None and count == 0:
+            raise ValueError("--bind needs a learner process; --workers 0 runs everything in one")
+        return LocalEngine(count, access=open_access(bind, keys))
     if (workers, bind, keys) != (None, None, None):
         raise ValueError("--workers, --bind and --keys belong to --engine local; a Ray cluster has its own workers")
     try:
@@ -332,21 +334,6 @@ def _engine(
         raise ValueError(f"--engine ray needs Ray (pip install 'oodil[ray]'): {error}") from None
     connect(trust_cluster)
     return RayEngine()
-
-
-def _access(bind: str | None, keys: Path | None, workers: int | None) -> "Access | None":
-    """Return where other machines may join; refuse to listen without keys, or where it cannot be done."""
-    if bind is None and keys is None:
-        return None
-    if bind is None or keys is None:
-        raise ValueError("--bind and --keys belong together: nobody joins a run without a key (`oodil keys new`)")
-    if workers == 0:
-        raise ValueError("--bind needs a learner process; --workers 0 runs everything in one")
-    from workers.channels import Access, check_access
-
-    access = Access(bind, keys)
-    check_access(access)
-    return access
 
 
 def _execute(opened: "Run", engine: "Engine", until: str | None, force: str | None) -> None:

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from pipeline.results import shown_return
 from workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, JobWarning, WorkerRestarted
 
 if TYPE_CHECKING:
@@ -170,9 +171,9 @@ def print_summary(results: dict[str, float], report: Path) -> None:
 def _figure(name: str, value: float) -> str:
     if name == "seconds":
         return _duration(value)
-    if name == "env_steps" or name.endswith("return"):
-        return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
-    return f"{value:.3f}"
+    if name == "env_steps":
+        return f"{value:,.0f}"
+    return shown_return(value) if name.endswith("return") else f"{value:.3f}"
 
 
 def print_status(described: dict[str, Any]) -> None:

@@ -112,6 +112,11 @@ def summary(run: Run) -> dict[str, float]:
     return {name: value for name, value in found.items() if value is not None}
 
 
+def shown_return(value: float) -> str:
+    """Return an episode return in the digits that it deserves."""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
 def _events(run: Run) -> list[dict[str, Any]]:
     try:
         lines = run.directory.events.read_text(encoding="utf-8", errors="replace").splitlines()

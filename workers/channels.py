@@ -204,16 +204,24 @@ def new_key_pair() -> KeyPair:
     return KeyPair(public, secret)
 
 
-def check_access(access: Access) -> None:
-    """Raise AddressError or KeysError if nothing can listen there now, or with these keys."""
-    server_keys(access.keys)
+def open_access(address: str | None, keys: Path | None) -> Access | None:
+    """Return where other machines may join, or None when nothing was asked for.
+
+    Raises AddressError or KeysError without keys, with malformed ones, or if nothing can listen there now.
+    """
+    if address is None and keys is None:
+        return None
+    if address is None or keys is None:
+        raise KeysError("--bind and --keys belong together: nobody joins a run without a key (`oodil keys new`)")
+    server_keys(keys)
     context = zmq.Context()
     try:
-        context.socket(zmq.ROUTER).bind(access.address)
+        context.socket(zmq.ROUTER).bind(address)
     except zmq.ZMQError as error:
-        raise AddressError(f"cannot listen on {access.address}: {error.strerror}") from error
+        raise AddressError(f"cannot listen on {address}: {error.strerror}") from error
     finally:
         context.destroy(linger=0)
+    return Access(address, keys)
 
 
 def _authenticator(context: zmq.Context, keys: Path) -> ThreadAuthenticator:

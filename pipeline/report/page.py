@@ -1,4 +1,4 @@
-"""The page around the figures: what was run, what came out, and what a reader has to know before quoting it."""
+"""The page: its sections around the figures."""
 
 from html import escape
 from typing import Any
@@ -7,27 +7,12 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from pipeline.report import figures, pieces
+from pipeline.report import figures, opening, pieces
 from pipeline.report.collection import Collection, Source, read_collection
 from pipeline.report.figures import Curve
 from pipeline.report.style import CSS
 from pipeline.results import STAGES, Results
 from pipeline.stage import Run
-
-FEW_EPISODES = 20
-"""Below this a mean return is called rough."""
-UNSTABLE_LABELS = 0.9
-"""Below this share of labels that survive another draw, clusters are called unstable."""
-
-TITLES = {
-    "demonstrations": "demonstrations",
-    "clustering": "clustering",
-    "transferability": "transferability",
-    "imitation": "imitation",
-    "naive_gail": "naive GAIL",
-    "oracle": "oracle",
-}
-
 
 QUALITY = (
     ("silhouette", "silhouette", 3),
@@ -48,7 +33,7 @@ def render(run: Run) -> str:
         _clustering_section(results, collection),
         _provenance_section(results),
     ]
-    head = [_headline(results, collection), _cards(results), _notes(results, collection)]
+    head = [opening.headline(results, collection), opening.cards(results), opening.notes(results, collection)]
     title = escape(run.config.name)
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -59,171 +44,9 @@ def render(run: Run) -> str:
     )
 
 
-# -- the top of the page -------------------------------------------------------------------------------------------
-
-
-def _headline(results: Results, collection: Collection | None) -> str:
-    config = results.run.config
-    dynamics = ", ".join(f"{name} {value:g}" for name, value in config.environment.dynamics.items())
-    imitator = f"<b>{escape(config.environment.id)}</b> with {escape(dynamics or 'its own, unchanged dynamics')}"
-    if collection is None:
-        lead = f"Imitator: {imitator}."
-    else:
-        lead = f"Imitator: {imitator}. It learns from {pieces.plural(len(collection.transitions), 'demonstration')}"
-        lead += (
-            f" of {pieces.plural(len(collection.sources), 'source')}."
-            if collection.labelled
-            else "; whose is not known."
-        )
-    finding = _finding(results)
-    return (
-        f'<header>\n<p class="kicker">Imitation from demonstrators with other dynamics</p>\n'
-        f'<h1>{escape(config.name)}</h1>\n<p class="lead">{lead}</p>\n'
-        + (
-            pieces.legend(collection.sources, counts=True) + _families(collection)
-            if collection and collection.labelled
-            else ""
-        )
-        + (f'<p class="finding">{finding}</p>\n' if finding else "")
-        + "</header>"
-    )
-
-
-def _families(collection: Collection) -> str:
-    """Say what the colours mean."""
-    meanings = {True: "Blue: known to be transferable to the imitator.", False: "Orange: known not to be."}
-    told = [meaning for known, meaning in meanings.items() if any(s.transferable is known for s in collection.sources)]
-    return pieces.caption(" ".join(told)) if told else ""
-
-
-def _finding(results: Results) -> str:
-    ours, naive, oracle = (
-        _final(results, stage).get("final_return") for stage in ("imitation", "naive_gail", "oracle")
-    )
-    if ours is None:
-        return ""
-    text = f"The policy learned from weighted demonstrations returns <b>{pieces.returned(ours)}</b>"
-    if naive is not None:
-        comparable = ours > 0 and naive > 0
-        text += f", {ours / naive:.1f} times" if comparable else ", against"
-        text += (
-            f" the {pieces.returned(naive)} of naive GAIL" if comparable else f" {pieces.returned(naive)} of naive GAIL"
-        )
-    if oracle is not None:
-        text += f"; the oracle, which is told what is transferable, reaches {pieces.returned(oracle)}"
-    return text + "."
-
-
-def _final(results: Results, stage: str) -> dict[str, Any]:
-    return results.json(stage, "evaluation.json")
-
-
-def _cards(results: Results) -> str:
-    scores = results.json("transferability", "summary.json")
-    diagnostics = results.json("clustering", "diagnostics.json")
-    seconds, env_steps = results.seconds(), results.env_steps()
-    cards = []
-    for stage, name in (("imitation", "ours"), ("naive_gail", "naive GAIL"), ("oracle", "oracle")):
-        final = _final(results, stage)
-        asked = stage in results.artifacts or stage in results.problems
-        cards.append(
-            _card(
-                f"Final return, {name}",
-                pieces.returned(final.get("final_return")),
-                _spread(final) if asked else "not asked for",
-            )
-        )
-    before, after = scores.get("transferable_share_before"), scores.get("transferable_share")
-    share = (
-        f'{pieces.percent(before)}<span class="arrow">→</span>{pieces.percent(after)}' if after is not None else None
-    )
-    cards.append(_card("Transferable share", share, "of what the policy learns from, before and after weighting"))
-    cards.append(
-        _card(
-            "AUROC", pieces.number(scores.get("auroc"), 3), "1 if all transferable demonstrations rank above all others"
-        )
-    )
-    cards.append(_card("Purity of clusters", pieces.number(diagnostics.get("purity"), 3), _cluster_note(diagnostics)))
-    cards.append(
-        _card("Environment steps", figures.count(sum(env_steps.values())) if env_steps else None, "in all trainings")
-    )
-    cards.append(_card("Time", pieces.duration(sum(seconds.values())) if seconds else None, "of all finished stages"))
-    return f'<dl class="cards">\n{"".join(cards)}</dl>'
-
-
-def _spread(final: dict[str, Any]) -> str:
-    spread, episodes = final.get("final_return_std"), final.get("episodes")
-    if spread is None or episodes is None:
-        return ""
-    digits = f"{spread:,.0f}" if abs(final.get("final_return") or 0) >= 100 else f"{spread:.2g}"
-    return f"± {digits} over {pieces.plural(episodes, 'episode')}"
-
-
-def _cluster_note(diagnostics: dict[str, Any]) -> str:
-    if not diagnostics:
-        return ""
-    return f"{diagnostics.get('non_empty_clusters')} of {diagnostics.get('num_clusters')} clusters in use"
-
-
-def _card(title: str, figure: str | None, note: str) -> str:
-    shown = f'<div class="figure">{figure}</div>' if figure is not None else '<div class="figure unknown">–</div>'
-    return f'<div class="card"><dt>{title}</dt><dd>{shown}<div class="note">{note}</div></dd></div>\n'
-
-
-def _notes(results: Results, collection: Collection | None) -> str:
-    """Say what limits the figures on this page."""
-    stages_with: dict[str, list[str]] = {}
-    for stage, problem in results.problems.items():
-        stages_with.setdefault(problem, []).append(TITLES[stage])
-    notes = [f"<b>Missing: {', '.join(stages)}</b>, {escape(problem)}." for problem, stages in stages_with.items()]
-    finals = {stage: _final(results, stage) for stage in ("imitation", "naive_gail", "oracle")}
-    trained = {stage: final for stage, final in finals.items() if final}
-    if trained:
-        seed = results.run.config.seed
-        notes.append(
-            f"One seed ({seed}). Returns of adversarial imitation vary a lot from seed to seed; a comparison needs "
-            "five or more. The spreads on this page are between episodes, not between seeds."
-        )
-    few = {
-        TITLES[stage]: final["episodes"] for stage, final in trained.items() if final.get("episodes", 99) < FEW_EPISODES
-    }
-    if few:
-        named = ", ".join(f"{title} {number}" for title, number in few.items())
-        notes.append(f"Few evaluation episodes ({named}): the mean returns are rough.")
-    steps = {stage: final.get("env_steps") for stage, final in trained.items()}
-    if len(set(steps.values())) > 1:
-        named = ", ".join(f"{TITLES[stage]} {figures.count(value or 0)}" for stage, value in steps.items())
-        notes.append(f"The final policies were not trained for equally long ({named} environment steps).")
-    if collection and any(source.transferable is None for source in collection.sources):
-        notes.append(
-            "It is not known of every source whether it is transferable, so there is no AUROC and no transferable "
-            "share to judge the scores by."
-        )
-    scores = results.json("transferability", "summary.json")
-    before, after = scores.get("transferable_share_before"), scores.get("transferable_share")
-    if before is not None and after is not None and after <= before:
-        notes.append(
-            "Weighting did not raise the transferable share: the scores do not favour what is transferable. Jobs that "
-            "are too short are the usual cause."
-        )
-    stability = results.json("clustering", "diagnostics.json").get("label_stability")
-    if stability is not None and stability < UNSTABLE_LABELS:
-        notes.append(
-            f"Clusters are unstable: only {pieces.percent(stability)} of the demonstrations keep theirs when other "
-            "parts of them are drawn."
-        )
-    if not notes:
-        return ""
-    items = "".join(f"<li>{note}</li>\n" for note in notes)
-    return f'<aside class="notes">\n<h3>Before you quote these figures</h3>\n<ul>\n{items}</ul>\n</aside>'
-
-
-# -- sections ------------------------------------------------------------------------------------------------------
-
-
 def _learning_section(results: Results) -> str:
     ours, naive = (_curve(results, stage) for stage in ("imitation", "naive_gail"))
-    oracle = _final(results, "oracle").get("final_return")
+    oracle = results.json("oracle", "evaluation.json").get("final_return")
     if ours is None and naive is None:
         return pieces.section("The policy", pieces.missing("No policy has been trained yet."))
     episodes = results.run.config.imitation.gail.evaluation_episodes
@@ -243,7 +66,7 @@ def _curve(results: Results, stage: str) -> Curve | None:
     if not found.get("env_steps"):
         return None
     values = (np.array(found[key], np.float64) for key in ("env_steps", "return_mean", "return_std"))
-    return Curve({"imitation": "ours"}.get(stage, TITLES[stage]), *values)
+    return Curve({"imitation": "ours"}.get(stage, pieces.TITLES[stage]), *values)
 
 
 def _transferability_section(results: Results, collection: Collection | None) -> str:
@@ -398,7 +221,7 @@ def _provenance_section(results: Results) -> str:
         steps = f"{env_steps[stage]:,}" if stage in env_steps else "–"
         made = f"<code>{artifact.sha256}</code>" if artifact else escape(results.problems[stage])
         numbers = f'<td class="number">{time}</td><td class="number">{steps}</td>'
-        rows += f"<tr><th>{TITLES[stage]}</th>{numbers}<td>{made}</td></tr>\n"
+        rows += f"<tr><th>{pieces.TITLES[stage]}</th>{numbers}<td>{made}</td></tr>\n"
     head = (
         '<th>stage</th><th class="number">time</th><th class="number">environment steps</th>'
         "<th>SHA-256 of the artifact</th>"
@@ -418,7 +241,7 @@ def _versions(results: Results) -> str:
     found: dict[str, dict[str, list[str]]] = {}
     for stage, artifact in results.artifacts.items():
         for library, version in artifact.versions.items():
-            found.setdefault(library, {}).setdefault(version, []).append(TITLES[stage])
+            found.setdefault(library, {}).setdefault(version, []).append(pieces.TITLES[stage])
     listed = []
     for library, versions in sorted(found.items()):
         each = [

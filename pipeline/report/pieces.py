@@ -4,6 +4,17 @@ from collections.abc import Iterable
 from html import escape
 
 from pipeline.report.collection import Source
+from pipeline.results import shown_return
+
+TITLES = {
+    "demonstrations": "demonstrations",
+    "clustering": "clustering",
+    "transferability": "transferability",
+    "imitation": "imitation",
+    "naive_gail": "naive GAIL",
+    "oracle": "oracle",
+}
+"""What the stages are called on the page."""
 
 
 def section(title: str, content: str) -> str:
@@ -51,10 +62,8 @@ def plural(number: int, noun: str) -> str:
 
 
 def returned(value: float | None) -> str | None:
-    """Return an episode return in the digits that it deserves."""
-    if value is None:
-        return None
-    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    """Return an episode return as it is written everywhere."""
+    return None if value is None else shown_return(value)
 
 
 def number(value: float | None, digits: int) -> str | None:
