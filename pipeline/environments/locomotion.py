@@ -91,7 +91,8 @@ class HopperEnv(hopper_v5.HopperEnv):
 class Walker2dEnv(walker2d_v5.Walker2dEnv):
     """Walker2d-v5 with root x in the observation and one sliding ``friction`` for both feet.
 
-    MuJoCo takes the larger friction of the two geoms in contact; the floor's is 0.7, so smaller values act as 0.7.
+    Of the two geoms in contact the feet decide. By MuJoCo's own rule the larger friction wins, and feet that are more
+    slippery than the floor, at 0.7, would change nothing.
     """
 
     velocity_limit = 10.0
@@ -102,6 +103,7 @@ class Walker2dEnv(walker2d_v5.Walker2dEnv):
         super().__init__(exclude_current_positions_from_observation=False, **kwargs)
         for foot in ("foot_geom", "foot_left_geom"):
             self.model.geom(foot).friction[0] = friction
+            self.model.geom(foot).priority[0] = 1
 
     def healthy_bounds(self) -> tuple[Floats, Floats]:
         """Return the bounds of a healthy state (18,), by the rule of Walker2d-v5."""

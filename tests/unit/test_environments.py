@@ -227,22 +227,10 @@ def foot_friction(friction):
     raise AssertionError("no foot touched the floor")
 
 
-@pytest.mark.parametrize(("friction", "effective"), [(24.8, 24.8), (1.1, 1.1), (0.7, 0.7), (0.1, 0.7)])
-def test_friction_of_the_feet_is_the_larger_of_the_two_surfaces(friction, effective):
-    assert foot_friction(friction) == pytest.approx(effective)
-
-
-def test_frictions_below_the_floors_are_the_same_dynamics():
-    def play(friction):
-        batch = make_batch(WALKER, {"friction": friction}, 1)
-        batch.reset(0, seed=0)
-        rng = np.random.default_rng(0)
-        for _ in range(40):
-            batch.step(rng.uniform(-1, 1, (1, 6)))
-        return batch.observations().tobytes()
-
-    assert play(0.1) == play(0.7)
-    assert play(0.1) != play(3.9)
+@pytest.mark.parametrize("friction", [24.8, 1.1, 0.7, 0.1])
+def test_the_feet_decide_on_the_friction_of_their_contacts(friction):
+    """Where the feet's is the larger one, MuJoCo's own rule gives the same: see the comparison with Gymnasium above."""
+    assert foot_friction(friction) == pytest.approx(friction)
 
 
 def test_motors_of_the_cheetah_scale_by_leg():
