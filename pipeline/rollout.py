@@ -3,6 +3,8 @@
 Letters: T steps, G simulators of one env group, S observation, A action.
 """
 
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -64,6 +66,15 @@ class UnitResult:
     group: int
     rollout: Rollout
     snapshot: Snapshot
+
+
+Follow = Callable[[UnitResult], list[Unit]]
+"""What a result is followed by: its group's next unit, or nothing yet."""
+
+
+def nothing_follows(result: UnitResult) -> list[Unit]:
+    """Leave it to the caller of `gather` to submit what comes next."""
+    return []
 
 
 @lru_cache(maxsize=32)
@@ -128,15 +139,18 @@ class InlineRollouts:
     """A rollout source that collects in the learner's own process, one unit after another."""
 
     def __init__(self) -> None:
-        self._units: list[Unit] = []
+        self._units: deque[Unit] = deque()
 
     def submit(self, units: list[Unit]) -> None:
-        """Keep the units of one iteration."""
-        if self._units:
-            raise ValueError("the units of the iteration before were not gathered")
-        self._units = list(units)
+        """Keep units for `gather`."""
+        self._units.extend(units)
 
-    def gather(self) -> list[UnitResult]:
-        """Collect them now, in order."""
-        units, self._units = self._units, []
-        return [collect(unit) for unit in units]
+    def gather(self, follow: Follow = nothing_follows) -> list[UnitResult]:
+        """Collect the iteration that was submitted first, in order; see `RolloutSource`."""
+        results: list[UnitResult] = []
+        first = self._units[0].iteration
+        while self._units and self._units[0].iteration == first:
+            result = collect(self._units.popleft())
+            results.append(result)
+            self.submit(follow(result))
+        return results

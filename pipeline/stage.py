@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from pipeline.artifacts import Artifact, Checkpoints, Files, RunDirectory, fingerprint, read_artifact
 from pipeline.config import RunConfig
-from pipeline.rollout import Unit, UnitResult
+from pipeline.rollout import Follow, Unit, UnitResult, nothing_follows
 
 
 class JobStoppedError(Exception):
@@ -21,10 +21,14 @@ class RolloutSource(Protocol):
     """Who collects: the job's own process, rollout workers behind a socket, or a cluster. All give the same bits."""
 
     def submit(self, units: list[Unit]) -> None:
-        """Hand over the units of one iteration; collection may begin at once."""
+        """Hand over units; collection may begin at once."""
 
-    def gather(self) -> list[UnitResult]:
-        """Wait for the submitted units and return their results in group order."""
+    def gather(self, follow: Follow = nothing_follows) -> list[UnitResult]:
+        """Wait for the iteration that was submitted first and return its results in group order.
+
+        What ``follow`` makes of a result is submitted as soon as the result is there, so that nobody who collects
+        waits for the slowest group. It is called once for each result, in any order, on the caller's thread.
+        """
 
 
 class JobContext(Protocol):

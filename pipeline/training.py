@@ -1,8 +1,9 @@
 """The training loop that experts, cluster jobs and the final learner share.
 
-Iteration i is collected under policy version i - lag (version 0 at first). With lag 1 the units of iteration i + 1 are
-handed out before update i, so workers collect while the learner learns; the order is fixed, so the bits are too. All
-randomness is keyed by iteration, so a checkpoint holds no generator.
+Iteration i is collected under policy version i - lag (version 0 at first). With lag 1 a group begins iteration i + 1 as
+soon as its part of iteration i and update i - 1 are there, so workers collect while the learner learns and never wait
+for the slowest of them; what a unit contains does not depend on when it is handed out. All randomness is keyed by
+iteration, so a checkpoint holds no generator.
 """
 
 import time
@@ -18,7 +19,7 @@ from pipeline.artifacts import Checkpoints
 from pipeline.config import EnvironmentConfig, TrainingConfig
 from pipeline.environments import Snapshot
 from pipeline.policy import GaussianPolicy
-from pipeline.rollout import Rollout, Unit
+from pipeline.rollout import Rollout, Unit, UnitResult, nothing_follows
 from pipeline.seeding import derive_key, torch_seed
 from pipeline.stage import JobContext, JobStoppedError
 
@@ -88,6 +89,21 @@ class _Position:
     snapshots: list[Snapshot | None]
     history: History
 
+    def unit(self, group: int, root_seed: int, environment: EnvironmentConfig, config: TrainingConfig) -> Unit:
+        """Return a group's unit of the next iteration."""
+        return Unit(
+            iteration=self.iteration,
+            group=group,
+            env_id=environment.id,
+            dynamics=tuple(sorted(environment.dynamics.items())),
+            num_simulators=config.simulators_per_group,
+            num_steps=config.steps_per_rollout,
+            policy_version=self.policy_version,
+            policy=self.policy,
+            key=derive_key(root_seed, "rollout", group, self.iteration),
+            snapshot=self.snapshots[group],
+        )
+
 
 def train(
     learner: Learner,
@@ -103,22 +119,31 @@ def train(
     """
     torch.set_num_threads(config.torch_threads)
     position = _resume(learner, config, context, checkpoints)
+
+    def unit(group: int) -> Unit:
+        return position.unit(group, learner.root_seed, environment, config)
+
+    def follow(result: UnitResult) -> list[Unit]:
+        position.snapshots[result.group] = result.snapshot
+        return [unit(result.group)]
+
     last_checkpoint = time.monotonic()
     returns, lengths = _Recent(), _Recent()
     if position.iteration < config.num_iterations:
-        context.rollouts.submit(_units(position, learner.root_seed, environment, config))
+        context.rollouts.submit([unit(group) for group in range(config.num_groups)])
     for iteration in range(position.iteration, config.num_iterations):
-        results = context.rollouts.gather()
+        is_last = iteration + 1 == config.num_iterations
+        position.iteration = iteration + 1
+        if config.lag == 1:
+            position.policy, position.policy_version = learner.behaviour_policy(), iteration
+        results = context.rollouts.gather(follow if config.lag == 1 and not is_last else nothing_follows)
         rollouts = [result.rollout for result in results]
         position.snapshots = [result.snapshot for result in results]
-        position.iteration = iteration + 1
+        metrics = learner.update(rollouts, iteration)
         if config.lag == 0:
-            metrics = learner.update(rollouts, iteration)
-        position.policy, position.policy_version = learner.behaviour_policy(), iteration + 1 - config.lag
-        if position.iteration < config.num_iterations:
-            context.rollouts.submit(_units(position, learner.root_seed, environment, config))
-        if config.lag == 1:
-            metrics = learner.update(rollouts, iteration)
+            position.policy, position.policy_version = learner.behaviour_policy(), position.iteration
+            if not is_last:
+                context.rollouts.submit([unit(group) for group in range(config.num_groups)])
         _refuse_divergence(learner, metrics, iteration)
 
         env_steps = position.iteration * config.steps_per_iteration
@@ -156,7 +181,7 @@ def experience(
     seed = torch_seed(derive_key(root_seed, "experience"))
     rollouts: list[Rollout] = []
     while position.iteration * config.steps_per_rollout < num_steps:
-        context.rollouts.submit(_units(position, seed, environment, config))
+        context.rollouts.submit([position.unit(g, seed, environment, config) for g in range(config.num_groups)])
         results = context.rollouts.gather()
         rollouts += [result.rollout for result in results]
         position.snapshots = [result.snapshot for result in results]
@@ -177,24 +202,6 @@ class _Recent:
 
     def mean(self, name: str) -> dict[str, float]:
         return {name: float(np.mean(self._values))} if self._values else {}
-
-
-def _units(position: _Position, root_seed: int, environment: EnvironmentConfig, config: TrainingConfig) -> list[Unit]:
-    return [
-        Unit(
-            iteration=position.iteration,
-            group=group,
-            env_id=environment.id,
-            dynamics=tuple(sorted(environment.dynamics.items())),
-            num_simulators=config.simulators_per_group,
-            num_steps=config.steps_per_rollout,
-            policy_version=position.policy_version,
-            policy=position.policy,
-            key=derive_key(root_seed, "rollout", group, position.iteration),
-            snapshot=snapshot,
-        )
-        for group, snapshot in enumerate(position.snapshots)
-    ]
 
 
 def _refuse_divergence(learner: Learner, metrics: dict[str, float], iteration: int) -> None:

@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,9 @@ from pipeline.artifacts import Files, RunDirectory, encode_arrays
 from pipeline.config import RunConfig
 from pipeline.loading import parse_config
 from pipeline.policy import GaussianPolicy
-from pipeline.rollout import Unit
+from pipeline.rollout import Unit, UnitResult, nothing_follows
 from pipeline.seeding import derive_key
-from pipeline.stage import JobContext, JobStoppedError, Run, Stage
+from pipeline.stage import JobContext, JobStoppedError, RolloutSource, Run, Stage
 
 STAGES = "tests.fakes:stage_named"
 NUM_GROUPS = 4
@@ -55,6 +56,19 @@ def hopper_units(
         )
         for group in range(count)
     ]
+
+
+def chain(rollouts: RolloutSource, iterations: int) -> list[UnitResult]:
+    """Collect several iterations, in which each group goes on from where it ended; return all results."""
+
+    def follow(result: UnitResult) -> list[Unit]:
+        return [replace(hopper_units(result.iteration + 1)[result.group], snapshot=result.snapshot)]
+
+    rollouts.submit(hopper_units(0))
+    results = []
+    for iteration in range(iterations):
+        results += rollouts.gather(follow if iteration + 1 < iterations else nothing_follows)
+    return results
 
 
 class FakeStage(Stage):

@@ -22,7 +22,7 @@ from ray.util import get_node_ip_address
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from pipeline.loading import ConfigError
-from pipeline.rollout import InlineRollouts, Unit, UnitResult, collect
+from pipeline.rollout import Follow, InlineRollouts, Unit, UnitResult, collect, nothing_follows
 from pipeline.stage import JobStoppedError, Run, Stage
 from pipeline.versions import collecting_versions
 from workers import job as job_process
@@ -268,24 +268,29 @@ class RayRollouts:
         self._unit_timeout_s = unit_timeout_s
         self._collect = ray.remote(_collect).options(max_retries=-1)
         self._versions = collecting_versions()
-        self._answers: list[Any] = []
+        self._answers: dict[Any, int] = {}
+        """Tasks and the iterations of their units, as they were submitted."""
 
     def submit(self, units: list[Unit]) -> None:
-        """Hand over the units of one iteration."""
-        self._answers = [
-            self._collect.remote(self._versions, encode(UnitMessage(_HEADER, unit)), self._unit_timeout_s)
-            for unit in units
-        ]
+        """Hand over units, each as a task."""
+        for unit in units:
+            frames = encode(UnitMessage(_HEADER, unit))
+            self._answers[self._collect.remote(self._versions, frames, self._unit_timeout_s)] = unit.iteration
 
-    def gather(self) -> list[UnitResult]:
-        """Wait for the submitted units and return their results in group order; raises what collecting raised."""
+    def gather(self, follow: Follow = nothing_follows) -> list[UnitResult]:
+        """Wait for the iteration that was submitted first, see `RolloutSource`; raises what collecting raised."""
+        first = min(self._answers.values())
+        waiting = [answer for answer, iteration in self._answers.items() if iteration == first]
         results = []
-        for frames in ray.get(self._answers):
-            message = decode(frames)
+        while waiting:
+            (answer,), waiting = ray.wait(waiting, num_returns=1)
+            del self._answers[answer]
+            message = decode(ray.get(answer))
             if not isinstance(message, ResultMessage):
                 raise MessageError(f"a unit was answered by {type(message).__name__}")
             results.append(message.result)
-        return results
+            self.submit(follow(message.result))
+        return sorted(results, key=lambda result: result.group)
 
 
 def _collect(versions: str, frames: list[bytes], timeout_s: float) -> list[bytes]:

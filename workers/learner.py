@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from pipeline.rollout import Unit, UnitResult
+from pipeline.rollout import Follow, Unit, UnitResult, nothing_follows
 from pipeline.stage import JobStoppedError
 from pipeline.versions import collecting_versions
 from workers.channels import Access, Router
@@ -58,27 +58,33 @@ class Dispatcher:
         self._unit_timeout_s = unit_timeout_s
         self._workers: dict[str, _Worker] = {}
         self._units: dict[UnitName, Unit] = {}
+        """Those without a result."""
         self._queue: deque[UnitName] = deque()
-        self._results: dict[UnitName, UnitResult] = {}
+        self._submitted: Counter[int] = Counter()
+        self._results: dict[int, list[UnitResult]] = {}
         self._failures: dict[UnitName, dict[str, int]] = {}
         self._durations: deque[float] = deque(maxlen=_RECENT)
         self._homes: dict[int, str] = {}
         """The worker that collected a group last; it may still have the group's simulators where they stopped."""
 
     def submit(self, units: list[Unit]) -> None:
-        """Take the units of the next iteration. Raises ValueError when those before were not taken."""
-        if self._units:
-            raise ValueError("the units of the iteration before were not gathered")
-        self._units = {(unit.iteration, unit.group): unit for unit in units}
-        self._queue.extend(self._units)
+        """Take units to be collected. Raises ValueError for one that is waited for already."""
+        for unit in units:
+            name = (unit.iteration, unit.group)
+            if name in self._units:
+                raise ValueError(f"unit {name} was submitted twice")
+            self._units[name] = unit
+            self._queue.append(name)
+            self._submitted[unit.iteration] += 1
 
-    def take(self) -> list[UnitResult] | None:
-        """Return the results of all units in the order they were submitted, once, or None while some are missing."""
-        if len(self._results) < len(self._units):
-            return None
-        results = [self._results[name] for name in self._units]
-        self._units, self._results, self._failures = {}, {}, {}
-        return results
+    def next_iteration(self) -> tuple[int, int]:
+        """Return the earliest iteration that nobody has asked for, and how many units of it were submitted."""
+        first = min(self._submitted)
+        return first, self._submitted.pop(first)
+
+    def take(self, iteration: int) -> list[UnitResult]:
+        """Return the results of an iteration that have come since they were taken last."""
+        return self._results.pop(iteration, [])
 
     def ready(self, worker: str) -> None:
         """Note that a worker is there."""
@@ -89,7 +95,7 @@ class Dispatcher:
         name = (result.iteration, result.group)
         given = self._answered(worker, name, now)
         unit = self._units.get(name)
-        if unit is None or name in self._results:
+        if unit is None:
             self.dropped["duplicate"] += 1
             return
         rollout = result.rollout
@@ -101,13 +107,15 @@ class Dispatcher:
             self._durations.append(now - given)
         if name in self._queue:
             self._queue.remove(name)
-        self._results[name] = result
+        del self._units[name]
+        self._failures.pop(name, None)
+        self._results.setdefault(result.iteration, []).append(result)
         self._homes[result.group] = worker
 
     def failed(self, worker: str, name: UnitName, traceback: str, now: float) -> None:
         """Note that a unit raised; another worker gets it. Raises CollectError when that happened too often."""
         self._answered(worker, name, now)
-        if name not in self._units or name in self._results:
+        if name not in self._units:
             self.dropped["duplicate"] += 1
             return
         failures = self._failures.setdefault(name, {})
@@ -166,7 +174,7 @@ class Dispatcher:
         given: dict[UnitName, float] = {}
         for worker in self._workers.values():
             for name, since in worker.held.items():
-                if name in self._units and name not in self._results:
+                if name in self._units:
                     given[name] = max(since, given.get(name, since))
         return given
 
@@ -178,7 +186,7 @@ class Dispatcher:
         return worker, self._units[name]
 
     def _give_back(self, name: UnitName) -> None:
-        if name in self._units and name not in self._results and name not in self._queue:
+        if name in self._units and name not in self._queue:
             self._queue.appendleft(name)
 
     def _answered(self, worker: str, name: UnitName, now: float) -> float | None:
@@ -222,27 +230,39 @@ class ZmqRollouts:
             return dict(self._dispatcher.dropped)
 
     def submit(self, units: list[Unit]) -> None:
-        """Hand over the units of one iteration; workers begin at once."""
+        """Hand over units; workers begin at once."""
         with self._changed:
             self._dispatcher.submit(units)
         self._channel.wake()
 
-    def gather(self) -> list[UnitResult]:
-        """Wait for the submitted units and return their results in the order they were submitted.
+    def gather(self, follow: Follow = nothing_follows) -> list[UnitResult]:
+        """Wait for the iteration that was submitted first; see `RolloutSource`.
 
         Raises CollectError when a unit raised too often, and JobStoppedError when a stop was asked for and no result
         has come since for some seconds. A stop alone does not end the wait: the job finishes its iteration.
         """
         began = time.monotonic()
+        results: list[UnitResult] = []
         with self._changed:
-            while (results := self._dispatcher.take()) is None:
-                if self._error is not None:
-                    raise self._error
-                quiet_s = time.monotonic() - max(began, self._last_result)
-                if quiet_s > _STOP_PATIENCE_S and self._should_stop():
-                    raise JobStoppedError(f"stopped, and no rollout worker answered for {quiet_s:.0f} s")
-                self._changed.wait(_POLL_S)
-        return results
+            iteration, count = self._dispatcher.next_iteration()
+        while len(results) < count:
+            with self._changed:
+                arrived = self._dispatcher.take(iteration)
+                if not arrived:
+                    self._wait(began)
+            for result in arrived:
+                results.append(result)
+                self.submit(follow(result))
+        return sorted(results, key=lambda result: result.group)
+
+    def _wait(self, began: float) -> None:
+        """Wait until something changes, with the lock held; raise what `gather` raises."""
+        if self._error is not None:
+            raise self._error
+        quiet_s = time.monotonic() - max(began, self._last_result)
+        if quiet_s > _STOP_PATIENCE_S and self._should_stop():
+            raise JobStoppedError(f"stopped, and no rollout worker answered for {quiet_s:.0f} s")
+        self._changed.wait(_POLL_S)
 
     def close(self) -> None:
         """Stop serving and close the socket; harmless when repeated."""

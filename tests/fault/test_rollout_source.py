@@ -12,9 +12,9 @@ import pytest
 
 import pipeline.rollout
 from pipeline.rollout import InlineRollouts, Unit, UnitResult, collect
-from pipeline.stage import JobStoppedError, RolloutSource
+from pipeline.stage import JobStoppedError
 from pipeline.versions import collecting_versions
-from tests.fakes import hopper_units, wait_until
+from tests.fakes import chain, hopper_units, wait_until
 from workers import learner, rollout
 from workers.channels import Dealer, private_endpoint
 from workers.learner import CollectError, Dispatcher, ZmqRollouts
@@ -134,35 +134,51 @@ def inline(units: list[Unit]) -> list[UnitResult]:
     return rollouts.gather()
 
 
-def chain(rollouts: RolloutSource, iterations: int) -> list[UnitResult]:
-    """Collect several iterations, each from where the one before ended."""
-    results: list[UnitResult] = []
-    for iteration in range(iterations):
-        units = hopper_units(iteration)
-        if results:
-            units = [replace(unit, snapshot=results[unit.group].snapshot) for unit in units]
-        rollouts.submit(units)
-        results = rollouts.gather()
-    return results
-
-
 @pytest.mark.parametrize("count", [1, 3])
 def test_workers_give_the_same_bits_as_no_workers(
     source: ZmqRollouts, endpoint: str, count: int, assert_same_bits: SameBits
 ) -> None:
     workers = Threads(endpoint, count)
     try:
-        assert_same_bits(chain(source, 3), chain(InlineRollouts(), 3))
+        assert_same_bits(chain(source, 4), chain(InlineRollouts(), 4))
         assert source.dropped == {}
     finally:
         workers.close()
 
 
-def test_a_source_takes_one_iteration_at_a_time(source: ZmqRollouts) -> None:
-    for rollouts in (source, InlineRollouts()):
-        rollouts.submit(hopper_units(0))
-        with pytest.raises(ValueError, match="not gathered"):
-            rollouts.submit(hopper_units(1))
+def test_a_group_goes_on_while_others_are_not_there(
+    source: ZmqRollouts, endpoint: str, assert_same_bits: SameBits
+) -> None:
+    first, second = hopper_units(0, count=2), hopper_units(1, count=2)
+    puppet = Puppet(endpoint, "puppet.1")
+    results: list[UnitResult] = []
+    source.submit(first)
+    gathering = threading.Thread(target=lambda: results.extend(source.gather(lambda got: [second[got.group]])))
+    gathering.start()
+    try:
+        puppet.ready()
+        assert [puppet.next_unit().group, puppet.next_unit().group] == [0, 1]
+        puppet.send(inline(first)[1])
+        ahead = puppet.next_unit()
+        assert (ahead.iteration, ahead.group) == (1, 1)
+        puppet.send(inline(second)[1])
+        wait_until(lambda: list(source._dispatcher._units) == [(0, 0)])
+        assert gathering.is_alive()
+        puppet.send(inline(first)[0])
+        gathering.join(30.0)
+        assert_same_bits(results, inline(first))
+        assert (puppet.next_unit().group, source.dropped) == (0, {})
+        puppet.send(inline(second)[0])
+        assert_same_bits(source.gather(), inline(second))
+    finally:
+        puppet.close()
+        source.close()
+
+
+def test_a_unit_that_is_submitted_twice_is_refused(source: ZmqRollouts) -> None:
+    source.submit(hopper_units(0))
+    with pytest.raises(ValueError, match=r"\(0, 1\) was submitted twice"):
+        source.submit(hopper_units(0)[1:])
 
 
 def test_only_the_first_honest_result_counts(source: ZmqRollouts, endpoint: str, assert_same_bits: SameBits) -> None:

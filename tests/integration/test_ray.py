@@ -15,7 +15,7 @@ from pipeline.loading import load_config
 from pipeline.policy import GaussianPolicy
 from pipeline.rollout import InlineRollouts
 from pipeline.stages import stages
-from tests.fakes import STAGES, FakeStage, fake_run, hopper_units, lines, wait_until
+from tests.fakes import STAGES, FakeStage, chain, fake_run, hopper_units, lines, wait_until
 from tests.flaky import FOLDER_VARIABLE
 from tests.runs import MICRO
 from walk import open_run, walk
@@ -102,10 +102,7 @@ def test_a_learner_on_ray_stops_and_goes_on(tmp_path: Path, cluster: Cluster) ->
 
 
 def test_units_give_the_same_bits_on_ray(cluster: Cluster, assert_same_bits) -> None:
-    sources = InlineRollouts(), RayRollouts(unit_timeout_s=60)
-    for source in sources:
-        source.submit(hopper_units(3))
-    assert_same_bits(*[source.gather() for source in sources])
+    assert_same_bits(chain(RayRollouts(unit_timeout_s=60), 3), chain(InlineRollouts(), 3))
 
 
 def test_a_unit_that_hangs_is_collected_again(misdeeds: Path, cluster: Cluster, assert_same_bits) -> None:
