@@ -42,6 +42,25 @@ class MLP(nn.Module):
         return inputs
 
     @torch.no_grad()
+    def head(self, layer_inputs: list[Tensor]) -> Tensor:
+        """Return (B, outputs) from what `layer_inputs` returned."""
+        return self.layers[-1](layer_inputs[-1])
+
+    @torch.no_grad()
+    def gradients(self, layer_inputs: list[Tensor], output_gradient: Tensor) -> list[Tensor]:
+        """Return the gradient of each parameter, ordered as `parameters()`, for a gradient (B, outputs) of the output.
+
+        Reverse-mode differentiation by hand, to the bits of autograd and without the graph that it keeps.
+        """
+        gradients: list[Tensor] = []
+        flowing = output_gradient
+        for layer, inputs in zip(reversed(self.layers), reversed(layer_inputs), strict=True):
+            gradients[:0] = [flowing.T.mm(inputs), flowing.sum(0)]
+            if layer is not self.layers[0]:
+                flowing = torch.ops.aten.tanh_backward(flowing.mm(layer.weight), inputs)
+        return gradients
+
+    @torch.no_grad()
     def directional_derivative(self, layer_inputs: list[Tensor], tangents: list[Tensor]) -> Tensor:
         """Return (B, outputs): the change of the output when the parameters move along ``tangents``.
 

@@ -1,4 +1,4 @@
-"""torch's Adam behind the three calls that a learner needs: step, state, load_state."""
+"""torch's Adam behind the calls that a learner needs."""
 
 import torch
 from torch import Tensor
@@ -26,6 +26,12 @@ class Adam:
         loss.backward()
         if max_grad_norm is not None:
             torch.nn.utils.clip_grad_norm_(self._parameters, max_grad_norm)
+        self._optimiser.step()
+
+    def apply(self, gradients: list[Tensor]) -> None:
+        """Take one step by gradients that are known, one for each parameter."""
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
+            parameter.grad = gradient
         self._optimiser.step()
 
     def state(self) -> dict[str, Tensor]:

@@ -80,7 +80,6 @@ class Trpo:
         old_mean, old_log_std = mean.detach(), policy.log_std.detach().clone()
         # Curvature is needed less exactly than the gradient, and its products are the dear part of a step.
         fewer = inputs[:: config.fisher_every]
-        fewer_means = policy.net(fewer)
         precision = torch.exp(-2 * old_log_std) / len(fewer)
         mean_parameters = list(policy.net.parameters())
         layer_inputs = policy.net.layer_inputs(fewer)
@@ -89,7 +88,7 @@ class Trpo:
             tangents = self._unflatten(vector)
             by_name = dict(zip(self._parameters, tangents, strict=True))
             change = policy.net.directional_derivative(layer_inputs, [by_name[p] for p in mean_parameters])
-            back = torch.autograd.grad(fewer_means, mean_parameters, change * precision, retain_graph=True)
+            back = policy.net.gradients(layer_inputs, change * precision)
             images = dict(zip(mean_parameters, back, strict=True))
             images[policy.log_std] = 2 * by_name[policy.log_std]
             return _flatten([images[p] for p in self._parameters]) + config.damping * vector

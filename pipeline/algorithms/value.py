@@ -23,11 +23,14 @@ class ValueFunction(nn.Module):
 
     def fit(self, inputs: Tensor, targets: Tensor, rng: torch.Generator) -> dict[str, float]:
         """Regress ``targets`` (B,) on ``inputs`` (B, S), each epoch in fresh random minibatches."""
-        loss = torch.zeros(())
+        errors = torch.zeros(1)
         for _ in range(self.config.epochs):
             order = torch.randperm(len(inputs), generator=rng)
             size = self.config.minibatch_size
             for some_inputs, some_targets in zip(inputs[order].split(size), targets[order].split(size), strict=True):
-                loss = (self(some_inputs) - some_targets).square().mean()
-                self.optimiser.step(loss)
-        return {"value_loss": float(loss.detach())}
+                layer_inputs = self.net.layer_inputs(some_inputs)
+                errors = self.net.head(layer_inputs).squeeze(-1) - some_targets
+                # Of the mean squared error.
+                gradient = errors * (2 / len(errors))
+                self.optimiser.apply(self.net.gradients(layer_inputs, gradient.unsqueeze(-1)))
+        return {"value_loss": float(errors.square().mean())}

@@ -21,6 +21,19 @@ def test_directional_derivative_equals_forward_mode_autodiff():
         torch.testing.assert_close(result, expected, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.parametrize(("batch", "inputs", "outputs"), [(256, 12, 1), (640, 12, 3), (5120, 24, 1), (7, 3, 2)])
+def test_gradients_have_the_bits_of_autograd(batch, inputs, outputs):
+    rng = torch.Generator().manual_seed(0)
+    for hidden in ((64, 64), (5,), (9, 8, 7)):
+        net = MLP(inputs, hidden, outputs, rng)
+        x, flowing = torch.randn(batch, inputs, generator=rng), torch.randn(batch, outputs, generator=rng)
+        output = net(x)
+        layer_inputs = net.layer_inputs(x)
+        assert torch.equal(net.head(layer_inputs), output)
+        expected = torch.autograd.grad(output, list(net.parameters()), flowing)
+        assert all(map(torch.equal, net.gradients(layer_inputs, flowing), expected))
+
+
 def test_mlp_is_linear_layers_with_tanh_between():
     net = MLP(1, (1,), 1, torch.Generator())
     with torch.no_grad():
