@@ -331,6 +331,13 @@ class Link:
             self._stop.set()
 
 
+def _compute_in_batches() -> None:
+    """Ask Linux for fewer, longer turns: more processes than cores compute all the time and respond to nobody."""
+    if hasattr(os, "SCHED_BATCH"):
+        with suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
 def _child_main(pipe: Pipe, log: str, identity: str, main: Main, arguments: dict[str, str]) -> None:
     # A terminal sends Ctrl-C to all of them; the parent alone decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -339,6 +346,7 @@ def _child_main(pipe: Pipe, log: str, identity: str, main: Main, arguments: dict
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     faulthandler.enable()
+    _compute_in_batches()
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
     link = Link(pipe, identity)
     try:
