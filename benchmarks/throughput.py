@@ -4,6 +4,8 @@ Each figure is a ratio whose two sides alternate within one run, so that a busy 
 
 * stepping: a batch of simulators against bare ``mj_step`` on one core, through the same states, in processor time;
 * learner: the whole GAIL loop against bare ``mj_step`` in one process per core, both at once;
+* scaling: rollouts from two worker processes against those from one, for a learner that does nothing but take them in,
+  so that each worker has a core to itself where there are two;
 * imitation: the same loop with PPO against the `imitation` library (benchmarks/README.md says how to install it).
 """
 
@@ -20,6 +22,7 @@ import platform
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -29,19 +32,29 @@ sys.path.insert(0, str(ROOT))
 
 import mujoco
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from bench import learner_rate
+from pipeline.algorithms.networks import PolicyNetwork
 from pipeline.config import PpoConfig, RunConfig
 from pipeline.environments import Snapshot, make_batch
 from pipeline.environments.batch import STATE
 from pipeline.loading import parse_config
+from pipeline.rollout import Unit, UnitResult
+from pipeline.seeding import derive_key
 from pipeline.versions import library_versions
+from workers import rollout as rollout_process
+from workers.channels import private_endpoint
+from workers.learner import ZmqRollouts
+from workers.supervisor import Restarts, Supervisor
 
+PARTS = ("stepping", "learner", "scaling")
 ENVIRONMENTS = ("oodil/Hopper-v0", "oodil/Walker2d-v0", "oodil/HalfCheetah-v0")
 SIMULATORS = 16
 STEPS_PER_ROUND = 50
 RAW_SECONDS = 3.0
+SCALING_SECONDS, WARM_UP_ITERATIONS = 5.0, 20
 IMITATION_BATCH, IMITATION_EPOCHS, IMITATION_MINIBATCH = 2560, 5, 512
 IMITATION_SETUP = """\
   python3.11 -m venv imitation-venv
@@ -170,6 +183,63 @@ def learner(env_id: str, workers: int, total_steps: int, rounds: int, cores: int
     }
 
 
+def rollout_rate(env_id: str, workers: int, seconds: float) -> float:
+    """Return the steps per second that workers collect while nobody learns; groups go on from where they stand."""
+    config = run_config(env_id, 1).imitation.gail
+    batch = make_batch(env_id, {}, 1)
+    network = PolicyNetwork(batch.observation_dim, batch.action_dim, config.policy_hidden, torch.Generator())
+
+    def unit(iteration: int, group: int, snapshot: Snapshot | None) -> Unit:
+        return Unit(
+            iteration=iteration,
+            group=group,
+            env_id=env_id,
+            dynamics=(),
+            num_simulators=config.simulators_per_group,
+            num_steps=config.steps_per_rollout,
+            policy_version=0,
+            policy=policy,
+            key=derive_key(0, "rollout", group, iteration),
+            snapshot=snapshot,
+        )
+
+    def follow(result: UnitResult) -> list[Unit]:
+        return [unit(result.iteration + 1, result.group, result.snapshot)]
+
+    policy = network.export()
+    with tempfile.TemporaryDirectory() as folder, private_endpoint(Path(folder)) as endpoint:
+        rollouts = ZmqRollouts(endpoint, "scaling", "first", unit_timeout_s=60.0)
+        with Supervisor(Path(folder), "scaling") as supervisor:
+            for index in range(workers):
+                shared = {"endpoint": endpoint, "run_id": "scaling"}
+                supervisor.start(f"worker-{index}", rollout_process.main, shared, Restarts(0, 0.0))
+            supervisor.poll(0.0)
+            rollouts.submit([unit(0, group, None) for group in range(config.num_groups)])
+            for _ in range(WARM_UP_ITERATIONS):
+                rollouts.gather(follow)
+            started, iterations = time.perf_counter(), 0
+            while time.perf_counter() - started < seconds:
+                rollouts.gather(follow)
+                iterations += 1
+            rate = iterations * config.steps_per_iteration / (time.perf_counter() - started)
+        rollouts.close()
+    return rate
+
+
+def scaling(env_id: str, rounds: int) -> dict[str, Any]:
+    """Compare two rollout workers with one."""
+    one, two = [], []
+    for _ in range(rounds):
+        one.append(rollout_rate(env_id, 1, SCALING_SECONDS))
+        two.append(rollout_rate(env_id, 2, SCALING_SECONDS))
+    return {
+        "one_worker_steps_per_s": statistics.median(one),
+        "two_workers_steps_per_s": statistics.median(two),
+        "ratio": statistics.median(b / a for a, b in zip(one, two, strict=True)),
+        "rounds": rounds,
+    }
+
+
 def imitation(python: str, total_steps: int, rounds: int, workers: int) -> dict[str, Any]:
     """Compare with the `imitation` library: GAIL, PPO, the same networks, batch, epochs and minibatches."""
     groups, simulators = 4, 8
@@ -225,7 +295,7 @@ def machine() -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="write the figures to this file")
-    parser.add_argument("--parts", nargs="*", choices=("stepping", "learner"), default=["stepping", "learner"])
+    parser.add_argument("--parts", nargs="*", choices=PARTS, default=PARTS)
     parser.add_argument("--envs", nargs="+", choices=ENVIRONMENTS, default=ENVIRONMENTS, metavar="ID")
     parser.add_argument(
         "--rounds", type=int, default=3, help="rounds of the long parts; stepping makes 20 times as many"
@@ -258,6 +328,15 @@ def main() -> None:
                     f"({workers} workers)",
                     flush=True,
                 )
+    if "scaling" in arguments.parts:
+        result["scaling"] = {}
+        for env_id in arguments.envs:
+            figures = result["scaling"][env_id] = scaling(env_id, arguments.rounds)
+            print(
+                f"scaling   {env_id:22} {figures['two_workers_steps_per_s']:9,.0f} /s with two workers, "
+                f"{figures['one_worker_steps_per_s']:9,.0f} with one: {figures['ratio']:.2f}",
+                flush=True,
+            )
     if arguments.imitation_python:
         figures = imitation(arguments.imitation_python, arguments.steps, arguments.rounds, workers=2)
         result["imitation"] = figures
