@@ -47,7 +47,8 @@ def describes_itself(link: Link) -> str:
     """Return what a child starts with."""
     print("to the log", flush=True)
     os.write(2, b"to the log as well\n")
-    return f"{os.environ['OMP_NUM_THREADS']} {signal.getsignal(signal.SIGINT) == signal.SIG_IGN}"
+    in_batches = not hasattr(os, "SCHED_BATCH") or os.sched_getscheduler(0) == os.SCHED_BATCH
+    return f"{os.environ['OMP_NUM_THREADS']} {signal.getsignal(signal.SIGINT) == signal.SIG_IGN} {in_batches}"
 
 
 def vanishes(link: Link) -> str:
@@ -85,7 +86,7 @@ def test_a_child_computes_with_one_thread_and_writes_its_log(tmp_path: Path, mon
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     with Supervisor(tmp_path, "stage") as supervisor:
         supervisor.start("child", describes_itself, {}, Restarts(0, 0.0))
-        assert poll_until(supervisor, Ended) == Ended("child", "1 True")
+        assert poll_until(supervisor, Ended) == Ended("child", "1 True True")
     assert (os.environ["OMP_NUM_THREADS"], os.environ.get("MKL_NUM_THREADS")) == ("7", None)
     assert (tmp_path / "stage-child.1.log").read_text() == "to the log\nto the log as well\n"
 
