@@ -103,6 +103,21 @@ def observe(x: Floats, y: Floats, heading: Floats, speed: float) -> Floats:
     )
 
 
+def touches(x: Floats, y: Floats, heading: Floats, box: Box) -> NDArray[np.bool_]:
+    """Return (G,) whether each car and the box overlap: they do unless one of four axes lies between them."""
+    dx, dy = np.abs(x - box.x), np.abs(y - box.y)
+    cos, sin = np.cos(heading), np.sin(heading)
+    long, wide = CAR_LENGTH / 2, CAR_WIDTH / 2
+    half_x, half_y = box.width / 2, box.depth / 2
+    along_x = dx <= half_x + long * np.abs(cos) + wide * np.abs(sin)
+    along_y = dy <= half_y + long * np.abs(sin) + wide * np.abs(cos)
+    ahead = np.abs((x - box.x) * cos + (y - box.y) * sin)
+    aside = np.abs((y - box.y) * cos - (x - box.x) * sin)
+    along_car = ahead <= long + half_x * np.abs(cos) + half_y * np.abs(sin)
+    across_car = aside <= wide + half_x * np.abs(sin) + half_y * np.abs(cos)
+    return np.asarray(along_x & along_y & along_car & across_car)
+
+
 class DrivingEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
     """The world with one car, made of highway-env's classes; the action is the steering angle in [-1, 1]."""
 
@@ -221,7 +236,8 @@ class DrivingBatch:
         self._heading += distance * np.sin(slip) / (CAR_LENGTH / 2)
         outside = ~((self._x > 0) & (self._x < WIDTH) & (self._y > 0) & (self._y < HEIGHT))
         first, second = self.layout.obstacles
-        crashed, reached = self._touches(first) | self._touches(second), self._touches(GOAL)
+        car = self._x, self._y, self._heading
+        crashed, reached = touches(*car, first) | touches(*car, second), touches(*car, GOAL)
         rewards = STEP_REWARD + GOAL_REWARD * reached + CRASH_REWARD * crashed + BORDER_REWARD * outside
         self._elapsed += 1
         self._returns += rewards
@@ -230,20 +246,6 @@ class DrivingBatch:
     def demonstrator(self) -> "Driver":
         """Return the hand-written driver of this world."""
         return Driver(self.layout)
-
-    def _touches(self, box: Box) -> NDArray[np.bool_]:
-        """Return (G,) whether each car and the box overlap: they do unless one of four axes lies between them."""
-        dx, dy = np.abs(self._x - box.x), np.abs(self._y - box.y)
-        cos, sin = np.cos(self._heading), np.sin(self._heading)
-        long, wide = CAR_LENGTH / 2, CAR_WIDTH / 2
-        half_x, half_y = box.width / 2, box.depth / 2
-        along_x = dx <= half_x + long * np.abs(cos) + wide * np.abs(sin)
-        along_y = dy <= half_y + long * np.abs(sin) + wide * np.abs(cos)
-        ahead = np.abs((self._x - box.x) * cos + (self._y - box.y) * sin)
-        aside = np.abs((self._y - box.y) * cos - (self._x - box.x) * sin)
-        along_car = ahead <= long + half_x * np.abs(cos) + half_y * np.abs(sin)
-        across_car = aside <= wide + half_x * np.abs(sin) + half_y * np.abs(cos)
-        return np.asarray(along_x & along_y & along_car & across_car)
 
     def elapsed_steps(self) -> NDArray[np.int64]:
         """Return (G,) steps since the last reset of each car."""

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.environments import make_batch
-from pipeline.environments.driving import GOAL, DrivingBatch, DrivingEnv, layout
+from pipeline.environments.driving import GOAL, DrivingBatch, DrivingEnv, layout, touches
 from pipeline.evaluation import run_episodes
 from pipeline.experts import hand_written
 from pipeline.seeding import generator
@@ -60,9 +60,8 @@ def test_cars_touch_what_they_touch_in_highway_env(
     env._car.position, env._car.heading = np.array([x, y]), heading
     thing = env._goal if is_goal else env._obstacles[1]
     env._car.handle_collisions(thing)
-    batch = DrivingBatch(layout(share, share, 1.0), 1, 1000)
-    batch._x[0], batch._y[0], batch._heading[0] = x, y, heading
-    touched = batch._touches(GOAL if is_goal else batch.layout.obstacles[1])[0]
+    box = GOAL if is_goal else layout(share, share, 1.0).obstacles[1]
+    touched = touches(np.array([x]), np.array([y]), np.array([heading]), box)[0]
     assert touched == (thing.hit if is_goal else env._car.crashed)
 
 
