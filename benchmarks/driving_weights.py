@@ -1,8 +1,8 @@
-"""What a finished run of configs/driving.yaml made of every path: a picture in the plane, and figures to judge it by.
+"""What a finished run of configs/driving.yaml made of every path: figures to judge it by, and a picture of the plane.
 
 A demonstration can be reproduced if it drives at the imitator's speed and never touches the imitator's obstacles, which
 is known exactly. Run ``python benchmarks/driving_weights.py RUN_DIR --picture docs/driving_weights.png``; it prints the
-scores by source and by whether the path is clear, and for each policy the share of episodes that reach the goal.
+scores by source and by whether the path is clear, and how many episodes of each policy reach the goal.
 
 Letters: N demonstrations, P states of all of them.
 """
@@ -12,7 +12,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
@@ -27,6 +29,7 @@ from pipeline.environments.driving import GOAL, HEIGHT, STEP_REWARD, WIDTH, Layo
 from pipeline.evaluation import run_episodes
 from pipeline.policy import GaussianPolicy
 from pipeline.seeding import derive_key, generator
+from pipeline.stage import Run
 from pipeline.stages.demonstrations import load_demonstrations
 from walk import read_run
 
@@ -46,25 +49,63 @@ def is_clear(demonstrations: Demonstrations, world: Layout) -> NDArray[np.bool_]
     return ~np.logical_or.reduceat(touched, demonstrations.offsets[:-1])
 
 
-def draw(demonstrations: Demonstrations, weights: NDArray[np.float64], world: Layout, titles: list[str]) -> Figure:
-    """Draw the paths of each source over the imitator's obstacles; the darker, the larger the weight."""
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
+def draw(demonstrations: Demonstrations, scores: NDArray[np.float64], world: Layout, titles: list[str]) -> Figure:
+    """Draw the paths of each source over the imitator's obstacles; the darker, the more transferable (N,)."""
+    figure = Figure(figsize=(11, 3.5), layout="constrained")
     panels = figure.subplots(1, len(titles), sharey=True)
     paths = np.split(positions(demonstrations), demonstrations.offsets[1:-1])
-    depths = 0.04 + 0.96 * weights / weights.max()
+    shades = LinearSegmentedColormap.from_list("shades", ("#dfe4ea", "#6f9bd1", "#0b2a5b"))
+    depth = Normalize(0, scores.max())
     for i, (axes, title) in enumerate(zip(panels, titles, strict=True)):
         axes.set_title(title, fontsize=9)
         axes.set(xlim=(0, WIDTH), ylim=(0, HEIGHT), aspect="equal", xlabel="m")
-        for box in world.obstacles:
+        for box, colour in ((GOAL, "#2f7d4f"), *((box, "#cf4f1b") for box in world.obstacles)):
             corner = box.left, box.y - box.depth / 2
-            axes.add_patch(Rectangle(corner, box.width, box.depth, color="#cf4f1b", alpha=0.55, linewidth=0, zorder=3))
-        strip = GOAL.left, GOAL.y - GOAL.depth / 2
-        axes.add_patch(Rectangle(strip, GOAL.width, GOAL.depth, color="#2f7d4f", alpha=0.5, linewidth=0))
+            axes.add_patch(Rectangle(corner, box.width, box.depth, color=colour, alpha=0.55, linewidth=0, zorder=3))
         mine = np.flatnonzero(demonstrations.sources == i)
-        mine = mine[np.argsort(depths[mine], kind="stable")]
-        colours = [(0.05, 0.15, 0.35, depth) for depth in depths[mine]]
-        axes.add_collection(LineCollection([paths[n] for n in mine], colors=colours, linewidths=0.7, zorder=2))
+        mine = mine[np.argsort(scores[mine], kind="stable")]  # the darkest on top
+        lines = LineCollection([paths[n] for n in mine], array=scores[mine], cmap=shades, norm=depth, linewidths=0.8)
+        axes.add_collection(lines)
+    figure.colorbar(ScalarMappable(depth, shades), ax=panels, label="transferability", pad=0.01, shrink=0.75)
     return figure
+
+
+def judge(run: Run, demonstrations: Demonstrations, world: Layout, scores: NDArray, weights: NDArray) -> list[str]:
+    """Print what the scores make of paths that can be reproduced and of others; return a title for each source."""
+    sources = run.config.demonstrations.sources
+    clear = is_clear(demonstrations, world)
+    at_its_speed = np.array([source.dynamics["speed"] == world.speed for source in sources])
+    reproducible = clear & at_its_speed[demonstrations.sources]
+    before, plain, after = (sampling_mass(each, demonstrations) for each in (np.ones_like(weights), scores, weights))
+
+    def shares(some: NDArray[np.bool_]) -> str:
+        return f"sampling mass {before[some].sum():.1%}, plain {plain[some].sum():.1%}, as used {after[some].sum():.1%}"
+
+    titles = []
+    for i, source in enumerate(sources):
+        mine = demonstrations.sources == i
+        titles.append(f"{source.label}\nsampling mass {before[mine].sum():.0%}, weighted {after[mine].sum():.0%}")
+        for kind, some in (("clear", mine & clear), ("blocked", mine & ~clear)):
+            if some.any():
+                spread = f"{scores[some].mean():.3g} ({scores[some].min():.3g} to {scores[some].max():.3g})"
+                print(f"{source.label}, {kind}: {some.sum()}, score {spread}, {shares(some)}")
+    auroc = roc_auc_score(reproducible, scores)
+    print(f"reproducible: {reproducible.sum()} of {len(reproducible)}, AUROC {auroc:.3f}, {shares(reproducible)}")
+    return titles
+
+
+def drive(run: Run, stage: str, num_episodes: int) -> str:
+    """Return what a stage's policy does in fresh episodes, also by the third of the start line that they begin in."""
+    environment = run.config.environment
+    policy = GaussianPolicy.from_arrays(run.artifact(stage).arrays("policy.safetensors"))
+    cars = make_batch(environment.id, environment.dynamics, num_episodes)
+    episodes = run_episodes(cars, policy, generator(derive_key(run.config.seed, "benchmark")), stochastic=False)
+    returns = np.array([episode.env_return for episode in episodes])
+    steps = np.array([len(episode.states) - 1 for episode in episodes])
+    third = np.array([(episode.states[0, 0] / 2 + 0.5) * WIDTH // 25 for episode in episodes])
+    reached = returns - STEP_REWARD * steps > 0
+    parts = ", ".join(f"{reached[third == i].mean():.1%}" for i in range(3))
+    return f"return {returns.mean():.0f}, {steps.mean():.0f} steps, reached the goal {reached.mean():.1%} ({parts})"
 
 
 def main() -> None:
@@ -75,40 +116,13 @@ def main() -> None:
     arguments = parser.parse_args()
     run = read_run(arguments.run_dir)
     demonstrations = load_demonstrations(run)
-    dynamics = run.config.environment.dynamics
-    world = layout(**dynamics)
+    world = layout(**run.config.environment.dynamics)
     results = run.artifact("transferability").arrays("transferability.safetensors")
-    scores, weights = results["scores"], results["weights"]
-    mass, before = (sampling_mass(each, demonstrations) for each in (weights, np.ones(len(weights))))
-    clear = is_clear(demonstrations, world)
-    sources = run.config.demonstrations.sources
-    at_its_speed = np.array([source.dynamics["speed"] == world.speed for source in sources])
-    reproducible = clear & at_its_speed[demonstrations.sources]
-    titles = []
-    for i, source in enumerate(sources):
-        mine = demonstrations.sources == i
-        titles.append(f"{source.label}: {mass[mine].sum():.0%} of the sampling mass")
-        for kind, some in (("clear", mine & clear), ("blocked", mine & ~clear)):
-            if some.any():
-                low, high = scores[some].min(), scores[some].max()
-                print(
-                    f"{source.label}, {kind}: {some.sum()} demonstrations, score {scores[some].mean():.4f} "
-                    f"({low:.4f} to {high:.4f}), mass {before[some].sum():.1%} -> {mass[some].sum():.1%}"
-                )
-    print(
-        f"reproducible: {reproducible.sum()} of {len(reproducible)}, AUROC {roc_auc_score(reproducible, scores):.3f}, "
-        f"mass {before[reproducible].sum():.1%} -> {mass[reproducible].sum():.1%}"
-    )
+    titles = judge(run, demonstrations, world, results["scores"], results["weights"])
     for stage, name in POLICIES.items():
-        policy = GaussianPolicy.from_arrays(run.artifact(stage).arrays("policy.safetensors"))
-        cars = make_batch(run.config.environment.id, dynamics, arguments.episodes)
-        episodes = run_episodes(cars, policy, generator(derive_key(run.config.seed, "benchmark")), stochastic=False)
-        returns = np.array([episode.env_return for episode in episodes])
-        steps = np.array([len(episode.states) - 1 for episode in episodes])
-        reached = returns - STEP_REWARD * steps > 0
-        print(f"{name}: return {returns.mean():.0f}, reached the goal {reached.mean():.1%}, {steps.mean():.0f} steps")
+        print(f"{name}: {drive(run, stage, arguments.episodes)}")
     if arguments.picture:
-        draw(demonstrations, weights, world, titles).savefig(arguments.picture, dpi=130)
+        draw(demonstrations, results["scores"], world, titles).savefig(arguments.picture, dpi=130)
 
 
 if __name__ == "__main__":
