@@ -86,8 +86,8 @@ class DiscriminatorConfig(_Section):
     steps_per_iteration: PositiveInt = 1
     """Full-batch steps after each policy update."""
     reward: Literal["positive", "logit"] = "positive"
-    """-log(1 - D), which also pays for going on, for tasks that end by failure; or log D - log(1 - D), for tasks that
-    end by success."""
+    """-log(1 - D), which also pays for going on; or log D - log(1 - D), which is negative away from the demonstrations
+    and may pay for ending."""
 
 
 class TrainingConfig(_Section):
