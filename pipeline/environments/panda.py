@@ -24,6 +24,9 @@ Floats = NDArray[np.float64]
 TIME_STEP = 1 / 240
 ALL_JOINTS = (1, 2, 3, 4, 5, 6)
 START_ANGLES = {1: 0.0, 2: -np.pi / 6, 3: 0.0, 4: -3.0, 5: 0.0, 6: 5 * np.pi / 6, 7: np.pi / 4}
+LOCKED_ELBOW = {2: 0.09, 4: -2.37, 6: 1.55}
+"""How an arm starts whose fourth joint is locked. Folded as the others start, it could not reach the goal; straighter
+than this, it could not get behind the box."""
 FINGER_POSITION = 0.03
 BOX_START, BOX_SIZE, BOX_MASS = (0.5, 0.0, 0.08), (0.3, 0.2, 0.2), 10.0
 BOX_FRICTION = 0.25
@@ -33,6 +36,11 @@ SUCCESS_REWARD, FAILURE_REWARD = 1000.0, -1000.0
 SERVO = 1000.0
 """N m s / rad. The wanted velocity is the distance to the wanted angle, per second, so this is the stiffness, too."""
 _SITE, _BOX_JOINT, _ARM = "gripper0_grip_site", "box_joint0", ("robot0_", "gripper0_")
+
+
+def start_angles(working: tuple[int, ...]) -> dict[int, float]:
+    """Return the angles of all joints at the middle of the starts; those that do not work are locked there."""
+    return START_ANGLES if 4 in working else START_ANGLES | LOCKED_ELBOW
 
 
 class Arm:
@@ -47,7 +55,7 @@ class Arm:
         """Where the working joints' angles are in ``qpos``."""
         self._freedoms = np.array([joint.dofadr[0] for joint in joints])
         self.low, self.high = np.array([joint.range for joint in joints]).T
-        self._start = np.array([START_ANGLES[n] for n in working])
+        self._start = np.array([start_angles(working)[n] for n in working])
         self._site = self.model.site(_SITE).id
         self._box = self.model.joint(_BOX_JOINT).qposadr[0]
         bodies = [self.model.body(geom.bodyid[0]).name for geom in map(self.model.geom, range(self.model.ngeom))]
@@ -206,33 +214,41 @@ class PandaBatch(MujocoBatch):
 
 
 class Pusher:
-    """The hand-written demonstrator: bring the hand behind the box, to its height, and then into it.
+    """The hand-written demonstrator: bring the hand behind the box, to the height of its push, and then into it.
 
-    It knows the joints that its arm has, so arms with other joints move the hand in other ways.
+    It knows the joints that its arm has, so arms with other joints move the hand in other ways. With a locked elbow the
+    hand does not get down behind the box, and pushes just below its upper edge.
     """
 
-    INTO, BEHIND = 0.1, 0.3
-    ALIGNED = 0.05
+    INTO = 0.1
     GAIN, MAX_SPEED = 3.0, 0.4
     DAMPING = 1e-3
+    CARE = np.array([1.0, 1.0, 3.0])
+    """Weights of an error in x, y and z: where an arm cannot have all three, it keeps the height."""
 
     def __init__(self, batch: PandaBatch) -> None:
         self._batch = batch
+        elbow_works = 4 in batch.arm.working
+        self._behind = 0.3 if elbow_works else 0.2
+        self._push = np.array([0.0, 0.0, 0.0 if elbow_works else 0.085])
+        self._aligned = np.array([0.05, 0.05 if elbow_works else 0.02])
 
     def mean(self, observations: Floats) -> NDArray[np.float32]:
         """Return (G, J) actions for (G, 6) observations of the batch as it stands."""
         return np.array([self._act(i, *np.split(row, 2)) for i, row in enumerate(observations)], np.float32)
 
     def _act(self, simulator: int, hand: Floats, box: Floats) -> Floats:
-        is_aligned = (np.abs(box - hand)[1:] < self.ALIGNED).all()
-        goal = box - (self.INTO if is_aligned else self.BEHIND, 0.0, 0.0)
+        pushed = box + self._push
+        is_aligned = (np.abs(pushed - hand)[1:] < self._aligned).all()
+        goal = pushed - (self.INTO if is_aligned else self._behind, 0.0, 0.0)
         velocity = self.GAIN * (goal - hand)
         velocity *= min(1.0, self.MAX_SPEED / max(float(np.linalg.norm(velocity)), 1e-9))
         jacobian, angles, wanted = self._batch.kinematics(simulator)
+        jacobian = self.CARE[:, None] * jacobian
         # Damped least squares: https://en.wikipedia.org/wiki/Inverse_kinematics
-        turning = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + self.DAMPING * np.eye(3), velocity)
+        solved = np.linalg.solve(jacobian @ jacobian.T + self.DAMPING * np.eye(3), self.CARE * velocity)
         # The servos turn a joint by its distance to the wanted angle, per second.
-        return np.clip((angles + turning - wanted) / TIME_STEP, -1, 1)
+        return np.clip((angles + jacobian.T @ solved - wanted) / TIME_STEP, -1, 1)
 
 
 def _joint_name(number: int) -> str:
@@ -258,7 +274,7 @@ def _compile(working: tuple[int, ...]) -> mujoco.MjModel:
                     geom.contype, geom.conaffinity = 2, 1
             for joint in list(body.joints):
                 if joint.name not in map(_joint_name, working):
-                    _lock(spec, body, joint)
+                    _lock(spec, body, joint, start_angles(working))
     box = spec.geom("box_g0")
     # With a higher priority than any other geom, the box alone decides on the friction of its contacts.
     box.priority, box.friction[0] = 1, BOX_FRICTION
@@ -280,7 +296,7 @@ def _compile(working: tuple[int, ...]) -> mujoco.MjModel:
     return spec.compile()
 
 
-def _lock(spec: mujoco.MjSpec, body: Any, joint: Any) -> None:
+def _lock(spec: mujoco.MjSpec, body: Any, joint: Any, angles: dict[int, float]) -> None:
     """Fix a body to its parent, where the joint would hold it at the reset."""
     if joint.type == mujoco.mjtJoint.mjJNT_SLIDE:
         side = 1 if joint.range[1] > 0 else -1
@@ -289,7 +305,7 @@ def _lock(spec: mujoco.MjSpec, body: Any, joint: Any) -> None:
         body.pos = np.asarray(body.pos) + move
     else:
         turn, turned = np.empty(4), np.empty(4)
-        mujoco.mju_axisAngle2Quat(turn, np.asarray(joint.axis), START_ANGLES[int(joint.name[-1])])
+        mujoco.mju_axisAngle2Quat(turn, np.asarray(joint.axis), angles[int(joint.name[-1])])
         mujoco.mju_mulQuat(turned, np.asarray(body.quat), turn)
         body.quat = turned
     spec.delete(joint)
