@@ -63,14 +63,22 @@ class Arm:
 
     def start(self, data: mujoco.MjData, rng: np.random.Generator) -> None:
         """Draw angles until the hand is before the box and the arm touches nothing."""
-        data.qpos[self._box : self._box + 7] = (*BOX_START, 1, 0, 0, 0)
+        self.put_box(data)
         while True:
             drawn = self._start + rng.uniform(-self.spread, self.spread, len(self.working))
             data.qpos[self.angles] = np.clip(drawn, self.low, self.high)
             mujoco.mj_forward(self.model, data)
-            if self.hand(data)[0] < START_BEFORE_X and not self._is_arm[data.contact.geom].any():
+            if self.is_before_box(data):
                 break
         data.ctrl[:] = data.qpos[self.angles]
+
+    def put_box(self, data: mujoco.MjData) -> None:
+        """Put the box where it starts."""
+        data.qpos[self._box : self._box + 7] = (*BOX_START, 1, 0, 0, 0)
+
+    def is_before_box(self, data: mujoco.MjData) -> bool:
+        """Return whether an episode may start like this: the hand before the box, and the arm touching nothing."""
+        return bool(self.hand(data)[0] < START_BEFORE_X and not self._is_arm[data.contact.geom].any())
 
     def move(self, data: mujoco.MjData, action: NDArray[np.floating]) -> None:
         """Move the wanted angles by ``action`` (J,) in [-1, 1] rad/s for one control step."""

@@ -1,0 +1,138 @@
+"""What Panda's arms can do, by the simulator and without learning.
+
+follow: whether an imitator's arm can take the way that the hand of a demonstrator takes, at its pace and with the box
+in it. Followed means that the box ends at most 0.03 m before where the demonstration left it.
+
+two joints: how far an arm with joints 2 and 5 alone pushes the box, over random angles at which joints 4 and 6 are
+locked, random starts and random programmes of four constant actions.
+
+Run ``python benchmarks/panda_arms.py --json FILE``.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.throughput import machine
+from pipeline.environments import make_batch, panda
+from pipeline.environments.panda import ALL_JOINTS, BOX_START, TIME_STEP, Arm, Floats
+from pipeline.evaluation import run_episodes
+from pipeline.experts import hand_written
+from pipeline.seeding import generator
+from pipeline.versions import library_versions
+
+ENV_ID = "oodil/Panda-v0"
+FOLLOWED_BY = {(1, 3): [(1, 3), (1,), (), (6,), (4,)], (1, 3, 4): [(1, 3), (4,)]}
+"""Locked joints of imitators, and of the demonstrators that each is to follow."""
+LOOK_AHEAD = 24
+STARTS = 6
+
+
+def toward(arm: Arm, data: mujoco.MjData, velocity: Floats) -> Floats:
+    """Return (J,) turning that moves the hand with ``velocity``, by damped least squares."""
+    jacobian = arm.jacobian(data)
+    return np.asarray(jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-3 * np.eye(3), velocity))
+
+
+def placed(arm: Arm, hand: Floats) -> mujoco.MjData:
+    """Return the arm with its hand as near to ``hand`` as it gets without touching anything, from several starts."""
+    found: list[tuple[float, mujoco.MjData]] = []
+    for seed in range(STARTS):
+        data = mujoco.MjData(arm.model)
+        arm.start(data, np.random.default_rng(seed))
+        for _ in range(300):
+            mujoco.mj_kinematics(arm.model, data)
+            turned = data.qpos[arm.angles] + 0.3 * toward(arm, data, hand - arm.hand(data))
+            data.qpos[arm.angles] = np.clip(turned, arm.low, arm.high)
+        mujoco.mj_forward(arm.model, data)
+        data.ctrl[:] = data.qpos[arm.angles]
+        found.append((float(np.linalg.norm(hand - arm.hand(data))) + (not arm.is_before_box(data)), data))
+    return min(found, key=lambda each: each[0])[1]
+
+
+def follow(arm: Arm, states: NDArray[np.floating]) -> tuple[float, float]:
+    """Return the mean distance of the hand from a demonstration's, and by how much the box falls short of its end."""
+    hands = states[:, :3].astype(np.float64)
+    data = placed(arm, hands[0])
+    errors = []
+    for t in range(len(hands) - 1):
+        ahead = hands[min(t + LOOK_AHEAD, len(hands) - 1)]
+        turning = toward(arm, data, (ahead - arm.hand(data)) / (LOOK_AHEAD * TIME_STEP))
+        arm.move(data, (data.qpos[arm.angles] + turning - data.ctrl) / TIME_STEP)
+        errors.append(np.linalg.norm(hands[t + 1] - arm.hand(data)))
+    return float(np.mean(errors)), float(states[-1, 3] - arm.observe(data)[3])
+
+
+def follow_all(episodes: int) -> list[dict[str, Any]]:
+    rows = []
+    for imitator, demonstrators in FOLLOWED_BY.items():
+        arm = Arm(tuple(number for number in ALL_JOINTS if number not in imitator), 0.2)
+        for locked in demonstrators:
+            batch = make_batch(ENV_ID, {f"joint_{number}": 0.0 for number in locked}, episodes)
+            seen = run_episodes(batch, hand_written(batch, ENV_ID), generator((0,)), stochastic=False)
+            kept = [episode.states for episode in seen if episode.env_return > 500]
+            errors, short = np.array([follow(arm, states) for states in kept]).T
+            row = {
+                "imitator_locked": imitator,
+                "demonstrator_locked": locked,
+                "demonstrations": len(kept),
+                "followed": int((short <= 0.03).sum()),
+                "median_hand_error_m": round(float(np.median(errors)), 3),
+                "median_box_short_m": round(float(np.median(short)), 3),
+            }
+            print(row, flush=True)
+            rows.append(row)
+    return rows
+
+
+def two_joints(arms: int, programmes: int) -> dict[str, Any]:
+    rng = np.random.default_rng(0)
+    furthest, tried = BOX_START[0], 0
+    for _ in range(arms):
+        locked_at = {4: rng.uniform(-2.8, -1.8), 6: rng.uniform(0.2, 3.6)}
+        panda._compile.cache_clear()
+        with patch.dict(panda.LOCKED_ELBOW, locked_at):
+            arm = Arm((2, 5), 0.0)
+        for _ in range(programmes):
+            data = mujoco.MjData(arm.model)
+            arm.put_box(data)
+            for _ in range(100):
+                data.qpos[arm.angles] = rng.uniform(arm.low, arm.high)
+                mujoco.mj_forward(arm.model, data)
+                if arm.is_before_box(data):
+                    break
+            else:
+                continue
+            data.ctrl[:] = data.qpos[arm.angles]
+            tried += 1
+            for action in rng.uniform(-1, 1, (4, 2)):
+                for _ in range(250):
+                    arm.move(data, action)
+                    furthest = max(furthest, float(arm.observe(data)[3]))
+    return {"programmes": tried, "furthest_box_m": round(furthest, 3)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=16)
+    parser.add_argument("--arms", type=int, default=60)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    results = {"follow": follow_all(arguments.episodes), "two_joints": two_joints(arguments.arms, 10)}
+    print(results["two_joints"])
+    if arguments.json:
+        whole = {"machine": machine(), "versions": library_versions(), **results}
+        arguments.json.write_text(json.dumps(whole, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
