@@ -73,6 +73,13 @@ def read_run(path: Path) -> Run:
 def check_inputs(config: RunConfig) -> None:
     """Refuse, before any work, an environment that cannot be made and demonstrations that cannot fit it."""
     simulators = check_environment(config.environment.id, config.environment.dynamics)
+    for name in ("transferability", "imitation"):
+        ignored = getattr(config, name).gail.discriminator.ignored
+        if not set(ignored) < set(range(simulators.observation_dim)):
+            raise ConfigError(
+                f"{name}.gail.discriminator.ignored is {list(ignored)}; states have the dimensions 0 to "
+                f"{simulators.observation_dim - 1}, of which at least one must be seen"
+            )
     for source in config.demonstrations.sources:
         check_environment(config.environment.id, source.dynamics)
     check_demonstrations(config, simulators.observation_dim)

@@ -6,7 +6,7 @@ Every field has a type, a default where one is sensible, and a line below it. No
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
 Hidden = Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
@@ -85,6 +85,8 @@ class DiscriminatorConfig(_Section):
     """Adam's step size."""
     steps_per_iteration: PositiveInt = 1
     """Full-batch steps after each policy update."""
+    ignored: tuple[NonNegativeInt, ...] = ()
+    """State dimensions that it does not see: where a robot has got to, for one that cannot fall."""
     reward: Literal["positive", "logit"] = "positive"
     """-log(1 - D), which also pays for going on; or log D - log(1 - D), which is negative away from the demonstrations
     and may pay for ending."""

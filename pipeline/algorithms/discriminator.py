@@ -40,7 +40,8 @@ class Discriminator(nn.Module):
     def __init__(self, observation_dim: int, config: DiscriminatorConfig, rng: torch.Generator) -> None:
         super().__init__()
         self.config = config
-        self.net = MLP(2 * observation_dim, config.hidden, 1, rng)
+        self._seen = np.setdiff1d(np.arange(observation_dim), config.ignored)
+        self.net = MLP(2 * len(self._seen), config.hidden, 1, rng)
         self.restart_optimiser()
 
     def restart_optimiser(self) -> None:
@@ -52,7 +53,9 @@ class Discriminator(nn.Module):
         return self.net(pairs).squeeze(-1)
 
     def pairs(self, states: NDArray[np.float32], successors: NDArray[np.float32]) -> Tensor:
-        """Return (B, 2S) from (B, S) states and their successors."""
+        """Return (B, 2S) from (B, S) states and their successors, without the dimensions that are ignored."""
+        if self.config.ignored:
+            states, successors = states[:, self._seen], successors[:, self._seen]
         return torch.from_numpy(np.concatenate((states, successors), axis=1))
 
     def update(self, demonstration_pairs: Tensor, policy_pairs: Tensor) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -78,6 +79,15 @@ def test_training_separates_the_two_and_rewards_what_looks_like_a_demonstration(
             imitation_reward(discriminator(demonstration), "positive").mean()
             > 2 * imitation_reward(discriminator(policy), "positive").mean()
         )
+
+
+def test_ignored_dimensions_are_not_seen(pairs):
+    half_blind = build(ignored=(0, 2))
+    states = np.arange(12, dtype=np.float32).reshape(4, 3)
+    assert half_blind.pairs(states, 10 * states).tolist() == [[1, 10], [4, 40], [7, 70], [10, 100]]
+    elsewhere = states + np.array([5, 0, -3], np.float32)
+    same = [half_blind(half_blind.pairs(each, each)).tolist() for each in (states, elsewhere)]
+    assert same[0] == same[1]
 
 
 def test_metrics_describe_the_state_before_the_step(pairs):
