@@ -25,6 +25,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,12 +38,11 @@ from numpy.typing import NDArray
 
 from bench import learner_rate
 from pipeline.algorithms.networks import PolicyNetwork
-from pipeline.config import PpoConfig, RunConfig
+from pipeline.config import EnvironmentConfig, PpoConfig, RunConfig
 from pipeline.environments import Snapshot, make_batch
 from pipeline.environments.batch import STATE
 from pipeline.loading import parse_config
-from pipeline.rollout import Unit, UnitResult
-from pipeline.seeding import derive_key
+from pipeline.training import experience
 from pipeline.versions import library_versions
 from workers import rollout as rollout_process
 from workers.channels import private_endpoint
@@ -54,7 +54,8 @@ ENVIRONMENTS = ("oodil/Hopper-v0", "oodil/Walker2d-v0", "oodil/HalfCheetah-v0")
 SIMULATORS = 16
 STEPS_PER_ROUND = 50
 RAW_SECONDS = 3.0
-SCALING_SECONDS, WARM_UP_ITERATIONS = 5.0, 20
+SCALING_STEPS = 4_000
+"""Of each simulator."""
 IMITATION_BATCH, IMITATION_EPOCHS, IMITATION_MINIBATCH = 2560, 5, 512
 IMITATION_SETUP = """\
   python3.11 -m venv imitation-venv
@@ -183,55 +184,34 @@ def learner(env_id: str, workers: int, total_steps: int, rounds: int, cores: int
     }
 
 
-def rollout_rate(env_id: str, workers: int, seconds: float) -> float:
-    """Return the steps per second that workers collect while nobody learns; groups go on from where they stand."""
+def rollout_rate(env_id: str, workers: int) -> float:
+    """Return the steps per second that workers collect while nobody learns."""
     config = run_config(env_id, 1).imitation.gail
     batch = make_batch(env_id, {}, 1)
     network = PolicyNetwork(batch.observation_dim, batch.action_dim, config.policy_hidden, torch.Generator())
-
-    def unit(iteration: int, group: int, snapshot: Snapshot | None) -> Unit:
-        return Unit(
-            iteration=iteration,
-            group=group,
-            env_id=env_id,
-            dynamics=(),
-            num_simulators=config.simulators_per_group,
-            num_steps=config.steps_per_rollout,
-            policy_version=0,
-            policy=policy,
-            key=derive_key(0, "rollout", group, iteration),
-            snapshot=snapshot,
-        )
-
-    def follow(result: UnitResult) -> list[Unit]:
-        return [unit(result.iteration + 1, result.group, result.snapshot)]
-
-    policy = network.export()
+    environment, policy = EnvironmentConfig(id=env_id), network.export()
     with tempfile.TemporaryDirectory() as folder, private_endpoint(Path(folder)) as endpoint:
         rollouts = ZmqRollouts(endpoint, "scaling", "first", unit_timeout_s=60.0)
+        context: Any = SimpleNamespace(rollouts=rollouts)
         with Supervisor(Path(folder), "scaling") as supervisor:
             for index in range(workers):
                 shared = {"endpoint": endpoint, "run_id": "scaling"}
                 supervisor.start(f"worker-{index}", rollout_process.main, shared, Restarts(0, 0.0))
             supervisor.poll(0.0)
-            rollouts.submit([unit(0, group, None) for group in range(config.num_groups)])
-            for _ in range(WARM_UP_ITERATIONS):
-                rollouts.gather(follow)
-            started, iterations = time.perf_counter(), 0
-            while time.perf_counter() - started < seconds:
-                rollouts.gather(follow)
-                iterations += 1
-            rate = iterations * config.steps_per_iteration / (time.perf_counter() - started)
+            experience(policy, environment, config, SCALING_STEPS // 4, 0, context)  # processes start
+            started = time.perf_counter()
+            collected = experience(policy, environment, config, SCALING_STEPS, 1, context)
+            seconds = time.perf_counter() - started
         rollouts.close()
-    return rate
+    return sum(rollout.terminated.size for rollout in collected) / seconds
 
 
 def scaling(env_id: str, rounds: int) -> dict[str, Any]:
     """Compare two rollout workers with one."""
     one, two = [], []
     for _ in range(rounds):
-        one.append(rollout_rate(env_id, 1, SCALING_SECONDS))
-        two.append(rollout_rate(env_id, 2, SCALING_SECONDS))
+        one.append(rollout_rate(env_id, 1))
+        two.append(rollout_rate(env_id, 2))
     return {
         "one_worker_steps_per_s": statistics.median(one),
         "two_workers_steps_per_s": statistics.median(two),
