@@ -112,8 +112,9 @@ def collect(unit: Unit) -> UnitResult:
         current = simulators.observations()
         next_observations[t] = current
         env_rewards[t], terminated[t], truncated[t] = outcome.env_rewards, outcome.terminated, outcome.truncated
-        ended = np.flatnonzero(outcome.terminated | outcome.truncated)
-        if ended.size:
+        ends = outcome.terminated | outcome.truncated
+        if ends.any():
+            ended = np.flatnonzero(ends)
             returns.extend(simulators.episode_returns()[ended].tolist())
             lengths.extend(simulators.elapsed_steps()[ended].tolist())
             for g in ended.tolist():

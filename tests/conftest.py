@@ -48,6 +48,23 @@ def network() -> Callable[..., PolicyNetwork]:
 
 
 @pytest.fixture
+def plain_mlp() -> Callable[..., torch.Tensor]:
+    """Return an MLP as a function of its parameters and input, all in torch, which differentiates it in every way."""
+
+    def output(
+        parameters: list[torch.Tensor],
+        x: torch.Tensor,
+        tanh: Callable[[torch.Tensor], torch.Tensor] = torch.tanh,
+    ) -> torch.Tensor:
+        *hidden, head = zip(parameters[::2], parameters[1::2], strict=True)
+        for weight, bias in hidden:
+            x = tanh(torch.nn.functional.linear(x, weight, bias))
+        return torch.nn.functional.linear(x, *head)
+
+    return output
+
+
+@pytest.fixture
 def batch() -> Callable[..., Batch]:
     """Return a function that draws (observations, actions, log-probabilities, advantages) from a policy."""
 

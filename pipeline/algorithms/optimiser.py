@@ -1,5 +1,7 @@
 """torch's Adam behind the calls that a learner needs."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -20,18 +22,16 @@ class Adam:
     def learning_rate(self, value: float) -> None:
         self._optimiser.param_groups[0]["lr"] = value
 
-    def step(self, loss: Tensor, max_grad_norm: float | None = None) -> None:
+    def step(self, loss: Tensor) -> None:
         """Differentiate ``loss`` and take one step."""
-        self._optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        if max_grad_norm is not None:
-            torch.nn.utils.clip_grad_norm_(self._parameters, max_grad_norm)
-        self._optimiser.step()
+        self.apply(torch.autograd.grad(loss, self._parameters))
 
-    def apply(self, gradients: list[Tensor]) -> None:
+    def apply(self, gradients: Sequence[Tensor], max_grad_norm: float | None = None) -> None:
         """Take one step by gradients that are known, one for each parameter."""
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
+        if max_grad_norm is not None:
+            torch.nn.utils.clip_grad_norm_(self._parameters, max_grad_norm)
         self._optimiser.step()
 
     def state(self) -> dict[str, Tensor]:

@@ -74,21 +74,21 @@ class Trpo:
         config, policy = self.config, self.policy
         max_kl = config.max_kl * step_scale
         inputs = policy.normalise(observations)
-        mean = policy.net(inputs)
+        layer_inputs = policy.net.layer_inputs(inputs)
+        mean = policy.net.head(layer_inputs).requires_grad_()
         surrogate = (torch.exp(policy.log_prob(mean, actions) - log_probs) * advantages).mean()
-        gradient = _flatten(torch.autograd.grad(surrogate, self._parameters))
+        gradient = _flatten(policy.gradients(surrogate, mean, layer_inputs))
         old_mean, old_log_std = mean.detach(), policy.log_std.detach().clone()
         # Curvature is needed less exactly than the gradient, and its products are the dear part of a step.
-        fewer = inputs[:: config.fisher_every]
-        precision = torch.exp(-2 * old_log_std) / len(fewer)
+        fewer = [part[:: config.fisher_every].contiguous() for part in layer_inputs]
+        precision = torch.exp(-2 * old_log_std) / len(fewer[0])
         mean_parameters = list(policy.net.parameters())
-        layer_inputs = policy.net.layer_inputs(fewer)
 
         def fisher_product(vector: Tensor) -> Tensor:
             tangents = self._unflatten(vector)
             by_name = dict(zip(self._parameters, tangents, strict=True))
-            change = policy.net.directional_derivative(layer_inputs, [by_name[p] for p in mean_parameters])
-            back = policy.net.gradients(layer_inputs, change * precision)
+            change = policy.net.directional_derivative(fewer, [by_name[p] for p in mean_parameters])
+            back = policy.net.gradients(fewer, change * precision)
             images = dict(zip(mean_parameters, back, strict=True))
             images[policy.log_std] = 2 * by_name[policy.log_std]
             return _flatten([images[p] for p in self._parameters]) + config.damping * vector

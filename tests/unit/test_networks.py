@@ -4,34 +4,64 @@ import numpy as np
 import pytest
 import torch
 from torch.distributions import Independent, Normal
-from torch.func import functional_call, jvp
+from torch.func import jvp
 
 from pipeline.algorithms.networks import MLP, PolicyNetwork
 
 
-def test_directional_derivative_equals_forward_mode_autodiff():
+class NumpyTanh(torch.autograd.Function):
+    """NumPy's tanh for autograd."""
+
+    @staticmethod
+    def forward(ctx, x):
+        y = torch.from_numpy(np.tanh(x.detach().numpy()))
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx, gradient):
+        (y,) = ctx.saved_tensors
+        return torch.ops.aten.tanh_backward(gradient, y)
+
+
+def test_directional_derivative_equals_forward_mode_autodiff(plain_mlp):
     rng = torch.Generator().manual_seed(0)
     for hidden in ((7,), (5, 6), (4, 3, 2)):
         net = MLP(3, hidden, 2, rng).double()
         x = torch.randn(11, 3, generator=rng, dtype=torch.float64)
-        parameters = dict(net.named_parameters())
-        tangents = {k: torch.randn(p.shape, generator=rng, dtype=torch.float64) for k, p in parameters.items()}
-        _, expected = jvp(lambda p: functional_call(net, p, (x,)), (parameters,), (tangents,))  # noqa: B023
-        result = net.directional_derivative(net.layer_inputs(x), list(tangents.values()))
+        parameters = list(net.parameters())
+        tangents = [torch.randn(p.shape, generator=rng, dtype=torch.float64) for p in parameters]
+        _, expected = jvp(lambda p: plain_mlp(p, x), (parameters,), (tangents,))  # noqa: B023
+        result = net.directional_derivative(net.layer_inputs(x), tangents)
         torch.testing.assert_close(result, expected, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize(("batch", "inputs", "outputs"), [(256, 12, 1), (640, 12, 3), (5120, 24, 1), (7, 3, 2)])
-def test_gradients_have_the_bits_of_autograd(batch, inputs, outputs):
+def test_output_and_gradients_have_the_bits_of_autograd(plain_mlp, batch, inputs, outputs):
     rng = torch.Generator().manual_seed(0)
     for hidden in ((64, 64), (5,), (9, 8, 7)):
         net = MLP(inputs, hidden, outputs, rng)
         x, flowing = torch.randn(batch, inputs, generator=rng), torch.randn(batch, outputs, generator=rng)
-        output = net(x)
+        parameters = list(net.parameters())
+        output = plain_mlp(parameters, x, NumpyTanh.apply)
+        assert torch.equal(net(x), output)
         layer_inputs = net.layer_inputs(x)
         assert torch.equal(net.head(layer_inputs), output)
-        expected = torch.autograd.grad(output, list(net.parameters()), flowing)
+        expected = torch.autograd.grad(output, parameters, flowing)
         assert all(map(torch.equal, net.gradients(layer_inputs, flowing), expected))
+
+
+def test_a_policys_gradients_are_those_of_autograd(plain_mlp, network, batch):
+    policy = network().double()
+    observations, actions, _, _ = batch(policy, 50)
+    inputs, (log_std, *parameters) = policy.normalise(observations), policy.parameters()
+    expected = torch.autograd.grad(
+        policy.log_prob(plain_mlp(parameters, inputs), actions).square().mean(), [log_std, *parameters]
+    )
+    layer_inputs = policy.net.layer_inputs(inputs)
+    mean = policy.net.head(layer_inputs).requires_grad_()
+    result = policy.gradients(policy.log_prob(mean, actions).square().mean(), mean, layer_inputs)
+    torch.testing.assert_close(result, list(expected), rtol=1e-10, atol=1e-12)
 
 
 def test_mlp_is_linear_layers_with_tanh_between():

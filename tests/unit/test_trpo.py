@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from torch.distributions import Normal, kl_divergence
-from torch.func import functional_call, hessian
+from torch.func import hessian
 
 import pipeline.algorithms.trpo as trpo_module
 import pipeline.environments  # noqa: F401  (registers the ids)
@@ -56,7 +56,7 @@ def test_conjugate_gradient_stops_at_the_tolerance_and_at_the_limit():
 
 
 @pytest.mark.parametrize("every", [1, 4])
-def test_fisher_product_is_the_second_derivative_of_the_divergence(network, batch, monkeypatch, every):
+def test_fisher_product_is_the_second_derivative_of_the_divergence(network, batch, plain_mlp, monkeypatch, every):
     """The damped Fisher matrix, column by column, equals the Hessian of KL(old || new) over every n-th state."""
     policy = network(observation_dim=3, action_dim=2, hidden=(4, 3)).double()
     observations, actions, log_probs, advantages = batch(policy, 20)
@@ -67,16 +67,14 @@ def test_fisher_product_is_the_second_derivative_of_the_divergence(network, batc
         return conjugate_gradient(product, b, iterations, tolerance)
 
     monkeypatch.setattr(trpo_module, "conjugate_gradient", spy)
-    names = [name for name, _ in policy.named_parameters()]
     shapes = [p.shape for p in policy.parameters()]
     seen = observations[::every]
     old_mean, old_std = policy(seen).detach(), policy.log_std.detach().exp()
-    buffers = {name: value.clone() for name, value in policy.named_buffers()}
 
     def divergence(flat):
         parts = flat.split([shape.numel() for shape in shapes])
-        values = {name: part.view(shape) for name, part, shape in zip(names, parts, shapes, strict=True)}
-        new = Normal(functional_call(policy, values | buffers, (seen,)), values["log_std"].exp())
+        log_std, *layers = (part.view(shape) for part, shape in zip(parts, shapes, strict=True))
+        new = Normal(plain_mlp(layers, policy.normalise(seen)), log_std.exp())
         return kl_divergence(Normal(old_mean, old_std), new).sum(-1).mean()
 
     expected = hessian(divergence)(parameters_of(policy).clone())
