@@ -82,16 +82,12 @@ class Trpo:
         # Curvature is needed less exactly than the gradient, and its products are the dear part of a step.
         fewer = [part[:: config.fisher_every].contiguous() for part in layer_inputs]
         precision = torch.exp(-2 * old_log_std) / len(fewer[0])
-        mean_parameters = list(policy.net.parameters())
 
         def fisher_product(vector: Tensor) -> Tensor:
-            tangents = self._unflatten(vector)
-            by_name = dict(zip(self._parameters, tangents, strict=True))
-            change = policy.net.directional_derivative(fewer, [by_name[p] for p in mean_parameters])
-            back = policy.net.gradients(fewer, change * precision)
-            images = dict(zip(mean_parameters, back, strict=True))
-            images[policy.log_std] = 2 * by_name[policy.log_std]
-            return _flatten([images[p] for p in self._parameters]) + config.damping * vector
+            log_std_tangent, *tangents = self._unflatten(vector)
+            change = policy.net.directional_derivative(fewer, tangents)
+            images = [2 * log_std_tangent, *policy.net.gradients(fewer, change * precision)]
+            return _flatten(images) + config.damping * vector
 
         direction = conjugate_gradient(fisher_product, gradient, config.cg_iterations, config.cg_tolerance)
         curvature = direction @ fisher_product(direction)
