@@ -35,9 +35,12 @@ def test_an_expert_is_transferable_and_doing_nothing_is_not(tmp_path: Path) -> N
         biases=tuple(np.zeros_like(b) for b in expert.biases),
     )
     parts = []
-    for policy, label in ((expert, "expert"), (idle, "does nothing")):
-        simulators = make_batch("oodil/Hopper-v0", OWN, COUNT)
-        parts.append(Demonstrations.of(run_episodes(simulators, policy, generator((0,)), stochastic=False), label))
+    # As the demonstrations of a run, the expert's are of sampled actions and full length; the idle robot takes none.
+    for policy, label, samples in ((expert, "expert", True), (idle, "does nothing", False)):
+        simulators = make_batch("oodil/Hopper-v0", OWN, 2 * COUNT)
+        episodes = run_episodes(simulators, policy, generator((0,)), stochastic=samples)
+        wanted = [episode for episode in episodes if episode.terminated is not samples]
+        parts.append(Demonstrations.of(wanted[:COUNT], label))
     demonstrations = Demonstrations.joined(parts)
     does_nothing = demonstrations.sources == 1
     assert demonstrations.terminated[does_nothing].all() and not demonstrations.terminated[~does_nothing].any()
@@ -47,7 +50,7 @@ def test_an_expert_is_transferable_and_doing_nothing_is_not(tmp_path: Path) -> N
         "name": "controls",
         "environment": {"id": "oodil/Hopper-v0", "dynamics": OWN},
         "demonstrations": {"file": str(file)},
-        "transferability": {"gail": {"total_steps": 1_000_000}},
+        "transferability": {"gail": {"total_steps": 1_500_000}},
         "imitation": {"gail": {"total_steps": 1}},
     }
     config = parse_config(values, "controls")
