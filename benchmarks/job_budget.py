@@ -121,7 +121,9 @@ def main() -> None:
         summary["auroc"] = [float(roc_auc_score(marked, scores)) for scores in all_scores]
         print("transferable share: " + " ".join(f"{share:.1%}" for share in summary["transferable_share"]))
     if arguments.json:
-        whole = {"machine": machine(), "versions": library_versions(), "config": config.model_dump(mode="json")}
+        # Without the sources, whose paths are of this machine.
+        used = config.model_dump(mode="json", include={"name", "seed", "environment", "transferability"})
+        whole = {"machine": machine(), "versions": library_versions(), "config": used}
         arguments.json.write_text(json.dumps(whole | {"by_budget": summary, "jobs": rows}, indent=1) + "\n")
 
 
