@@ -4,9 +4,11 @@ The scores are read from each job's discriminator after it has gone on learning 
 imitator. The true reward plays no part.
 """
 
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.algorithms.transferability import (
     sampling_mass,
@@ -16,12 +18,76 @@ from pipeline.algorithms.transferability import (
 )
 from pipeline.artifacts import Files, encode_arrays, encode_json
 from pipeline.config import RunConfig
+from pipeline.data import Demonstrations
 from pipeline.environments import make_batch
 from pipeline.seeding import derive_key, torch_seed
 from pipeline.stage import JobContext, Run, Stage
 from pipeline.stages.demonstrations import load_demonstrations, transferable_mask
 
+if TYPE_CHECKING:
+    from pipeline.algorithms.gail import AdversarialReward
+    from pipeline.algorithms.learner import Learner
+
 _JOB_FILE = "scores.safetensors"
+
+
+@dataclass(frozen=True)
+class ClusterJob:
+    """The demonstrations of one cluster and an imitator of them in its own environment."""
+
+    config: RunConfig
+    members: NDArray[np.intp]
+    """Which of all demonstrations they are."""
+    demonstrations: Demonstrations
+    reward: "AdversarialReward"
+    learner: "Learner"
+    seed: int
+
+    @classmethod
+    def of(cls, run: Run, job: str) -> "ClusterJob":
+        """Return the job of that name, untrained."""
+        from pipeline.algorithms.gail import AdversarialReward
+        from pipeline.algorithms.learner import Learner
+
+        environment, gail = run.config.environment, run.config.transferability.gail
+        members = np.flatnonzero(_labels(run) == int(job.removeprefix("cluster-")))
+        demonstrations = load_demonstrations(run).select(members)
+        seed = torch_seed(derive_key(run.config.seed, TransferabilityStage.name, job))
+        simulators = make_batch(environment.id, environment.dynamics, 1)
+        reward = AdversarialReward(demonstrations, np.ones(len(members)), gail.discriminator, seed)
+        learner = Learner(simulators.observation_dim, simulators.action_dim, gail, reward, seed)
+        return cls(run.config, members, demonstrations, reward, learner, seed)
+
+    def settle(self, context: JobContext) -> int:
+        """Let the discriminator go on against the imitator as it is now; return the environment steps it saw."""
+        from pipeline.training import experience
+
+        environment, section = self.config.environment, self.config.transferability
+        horizon = make_batch(environment.id, environment.dynamics, 1).max_episode_steps
+        policy = self.learner.behaviour_policy()
+        rollouts = experience(policy, environment, section.gail, horizon, self.seed, context)
+        self.reward.settle(rollouts, section.final_steps, section.gail.steps_per_iteration)
+        return sum(rollout.terminated.size for rollout in rollouts)
+
+
+def told_apart(config: RunConfig, scores: NDArray[np.float64], demonstrations: Demonstrations) -> dict[str, float]:
+    """Return how well (N,) scores tell the sources that are marked transferable from those that are marked not to be.
+
+    ``auroc``, and the former's share of the sampling mass: before weighting, by the scores, by their power. Empty
+    without marks of both kinds.
+    """
+    marked = transferable_mask(config, demonstrations)
+    if marked is None or not 0 < marked.sum() < len(marked):
+        return {}
+    from sklearn.metrics import roc_auc_score
+
+    weights = {
+        "transferable_share_before": np.ones(len(demonstrations)),
+        "transferable_share_unsharpened": scores,
+        "transferable_share": sharpened_weights(scores, config.transferability.sharpening),
+    }
+    shares = {name: float(sampling_mass(w, demonstrations)[marked].sum()) for name, w in weights.items()}
+    return shares | {"auroc": float(roc_auc_score(marked, scores))}
 
 
 class TransferabilityStage(Stage):
@@ -51,36 +117,26 @@ class TransferabilityStage(Stage):
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Imitate one cluster in the imitator's environment and score its demonstrations along the way."""
-        from pipeline.algorithms.gail import AdversarialReward
-        from pipeline.algorithms.learner import Learner
-        from pipeline.training import Probe, experience, train
+        from pipeline.training import Probe, train
 
-        config = run.config
-        section = config.transferability
-        members = np.flatnonzero(_labels(run) == int(job.removeprefix("cluster-")))
-        demonstrations = load_demonstrations(run).select(members)
-        seed = torch_seed(derive_key(config.seed, self.name, job))
-        simulators = make_batch(config.environment.id, config.environment.dynamics, 1)
-        reward = AdversarialReward(demonstrations, np.ones(len(members)), section.gail.discriminator, seed)
-        learner = Learner(simulators.observation_dim, simulators.action_dim, section.gail, reward, seed)
-        probe = Probe("logits", section.num_scores, lambda: reward.mean_logits(demonstrations))
-        history = train(learner, config.environment, section.gail, [probe], context, self.checkpoints(run, job))
-        policy = learner.behaviour_policy()
-        rollouts = experience(policy, config.environment, section.gail, simulators.max_episode_steps, seed, context)
-        reward.settle(rollouts, section.final_steps, section.gail.steps_per_iteration)
-        env_steps = int(history.steps("logits")[-1]) + sum(rollout.terminated.size for rollout in rollouts)
+        config, gail = run.config, run.config.transferability.gail
+        cluster = ClusterJob.of(run, job)
+        reward, demonstrations = cluster.reward, cluster.demonstrations
+        probe = Probe("logits", config.transferability.num_scores, lambda: reward.mean_logits(demonstrations))
+        history = train(cluster.learner, config.environment, gail, [probe], context, self.checkpoints(run, job))
+        env_steps = int(history.steps("logits")[-1]) + cluster.settle(context)
         history.append("logits", env_steps, reward.mean_logits(demonstrations))
         discriminator = {name: value.numpy() for name, value in reward.discriminator.state_dict().items()}
         return {
             _JOB_FILE: encode_arrays(
                 {
-                    "demonstrations": members.astype(np.int64),
+                    "demonstrations": cluster.members.astype(np.int64),
                     "env_steps": history.steps("logits"),
                     "logits": history.values("logits"),
                 }
             ),
             "discriminator.safetensors": encode_arrays(discriminator),
-            "policy.safetensors": encode_arrays(policy.arrays()),
+            "policy.safetensors": encode_arrays(cluster.learner.behaviour_policy().arrays()),
         }
 
     def combine(self, run: Run) -> Files:
@@ -107,18 +163,7 @@ class TransferabilityStage(Stage):
                 label: float(scores[demonstrations.sources == i].mean())
                 for i, label in enumerate(demonstrations.source_labels)
             },
-        }
-        marked = transferable_mask(config, demonstrations)
-        if marked is not None and 0 < marked.sum() < len(marked):
-            from sklearn.metrics import roc_auc_score
-
-            shares = {
-                "transferable_share_before": np.ones(len(demonstrations)),
-                "transferable_share_unsharpened": scores,
-                "transferable_share": weights,
-            }
-            summary |= {name: float(sampling_mass(w, demonstrations)[marked].sum()) for name, w in shares.items()}
-            summary["auroc"] = float(roc_auc_score(marked, scores))
+        } | told_apart(config, scores, demonstrations)
         return {
             "transferability.safetensors": encode_arrays(arrays),
             "history.safetensors": encode_arrays(history),
