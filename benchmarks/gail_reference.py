@@ -2,7 +2,8 @@
 
 For every seed: environment steps and seconds until the deterministic policy first reaches a return of 2,900, and the
 return at the end of the budget. Run ``python benchmarks/gail_reference.py --json FILE``; ``--setting official`` takes
-the constants of the method's released code instead of the defaults, ``ppo`` the other generator.
+the constants of the method's released code instead of the defaults, ``ppo`` the other generator, ``wide`` and ``cheap``
+what would be faster per step.
 """
 
 import argparse
@@ -50,6 +51,13 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "lag": 0,
     },
     "ppo": {"generator": {"kind": "ppo"}},
+    "wide": {"simulators_per_group": 16, "steps_per_rollout": 40},
+    "cheap": {
+        "simulators_per_group": 16,
+        "steps_per_rollout": 40,
+        "generator": {"fisher_every": 8},
+        "value": {"epochs": 2},
+    },
 }
 
 

@@ -36,13 +36,14 @@ def test_an_expert_is_transferable_and_doing_nothing_is_not(tmp_path: Path) -> N
     )
     parts = []
     # As the demonstrations of a run, the expert's are of sampled actions and full length; the idle robot takes none.
-    for policy, label, samples in ((expert, "expert", True), (idle, "does nothing", False)):
+    for policy, label, falls in ((expert, "expert", False), (idle, "does nothing", True)):
         simulators = make_batch("oodil/Hopper-v0", OWN, 2 * COUNT)
-        episodes = run_episodes(simulators, policy, generator((0,)), stochastic=samples)
-        wanted = [episode for episode in episodes if episode.terminated is not samples]
+        episodes = run_episodes(simulators, policy, generator((0,)), stochastic=not falls)
+        wanted = [episode for episode in episodes if episode.terminated == falls]
         parts.append(Demonstrations.of(wanted[:COUNT], label))
     demonstrations = Demonstrations.joined(parts)
     does_nothing = demonstrations.sources == 1
+    assert len(demonstrations) == 2 * COUNT
     assert demonstrations.terminated[does_nothing].all() and not demonstrations.terminated[~does_nothing].any()
     file = tmp_path / "demonstrations.safetensors"
     file.write_bytes(encode_demonstrations(demonstrations, "oodil/Hopper-v0"))
