@@ -101,7 +101,7 @@ def main() -> None:
     by_budget = {"env_steps": jobs[0]["env_steps"].tolist()}
     by_budget |= {figure: [reading[figure] for reading in readings] for figure in readings[0]}
     for figure, values in by_budget.items():
-        print(f"{figure}: " + " ".join(f"{value:.6g}" for value in values))
+        print(f"{figure}: " + " ".join(f"{value:.7g}" for value in values))
     if arguments.json:
         # Without the sources, whose paths are of this machine.
         used = config.model_dump(mode="json", include={"name", "seed", "environment", "transferability"})
