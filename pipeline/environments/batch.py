@@ -3,6 +3,7 @@
 Letters: G simulators, S observation, A action.
 """
 
+import ctypes
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol
@@ -66,6 +67,15 @@ class Simulators(Protocol):
         """Continue from a snapshot of a batch of the same size and task."""
 
 
+def _stop_the_clock() -> None:
+    """Keep MuJoCo from timing itself: reading the clock for ``MjData.timer`` is a sixth of a step of Hopper.
+
+    The clock is the whole process's, so one that somebody has set stays.
+    """
+    if mujoco.get_mjcb_time() is None:
+        mujoco.set_mjcb_time(ctypes.pythonapi.PyFloat_GetMin)  # native code that returns always the same number
+
+
 class MujocoBatch(ABC):
     """G simulators of one compiled model, stepped at the speed of raw ``mj_step``; a `Simulators`."""
 
@@ -76,6 +86,7 @@ class MujocoBatch(ABC):
         self.num_simulators = num_simulators
         self.max_episode_steps = max_episode_steps
         self.action_dim = model.nu
+        _stop_the_clock()
         self._data = [mujoco.MjData(model) for _ in range(num_simulators)]
         self._elapsed = np.zeros(num_simulators, np.int64)
         self._returns = np.zeros(num_simulators)

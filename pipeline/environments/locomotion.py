@@ -154,6 +154,8 @@ class LocomotionBatch(MujocoBatch):
 
     def __init__(self, task: Task, num_simulators: int, max_episode_steps: int) -> None:
         super().__init__(task.model, num_simulators, max_episode_steps)
+        # A robot is one kinematic tree, so to look for islands of constraints, every time, finds nothing.
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
         self.task = task
         # Views into MuJoCo's memory, fetched once: every attribute access on MjData costs as much as a copy.
         self._controls = [data.ctrl for data in self._data]

@@ -1,5 +1,7 @@
 """The batched simulators against Gymnasium, step by step and to the bit; snapshots; dynamics that really change."""
 
+import time
+
 import gymnasium
 import mujoco
 import numpy as np
@@ -272,3 +274,14 @@ def test_one_environments_dynamics_do_not_leak_into_another():
 def test_bad_environments_are_refused(env_id, dynamics, message):
     with pytest.raises(ValueError, match=message):
         make_batch(env_id, dynamics, 1)
+
+
+def test_a_clock_that_somebody_has_set_stays():
+    """MuJoCo's clock belongs to the whole process; a batch stops it only if it is MuJoCo's own."""
+    before = mujoco.get_mjcb_time()
+    try:
+        mujoco.set_mjcb_time(time.perf_counter)
+        make_batch("oodil/Hopper-v0", {}, 1)
+        assert mujoco.get_mjcb_time() is time.perf_counter
+    finally:
+        mujoco.set_mjcb_time(before)
