@@ -75,7 +75,7 @@ def follow(arm: Arm, states: NDArray[np.floating]) -> tuple[float, float]:
 def follow_all(episodes: int) -> list[dict[str, Any]]:
     rows = []
     for imitator, demonstrators in FOLLOWED_BY.items():
-        arm = Arm(tuple(number for number in ALL_JOINTS if number not in imitator), 0.2)
+        arm = Arm(tuple(number for number in ALL_JOINTS if number not in imitator), 0.2, 1)
         for locked in demonstrators:
             batch = make_batch(ENV_ID, {f"joint_{number}": 0.0 for number in locked}, episodes)
             seen = run_episodes(batch, hand_written(batch, ENV_ID), generator((0,)), stochastic=False)
@@ -101,7 +101,7 @@ def two_joints(arms: int, programmes: int) -> dict[str, Any]:
         locked_at = {4: rng.uniform(-2.8, -1.8), 6: rng.uniform(0.2, 3.6)}
         panda._compile.cache_clear()
         with patch.dict(panda.LOCKED_ELBOW, locked_at):
-            arm = Arm((2, 5), 0.0)
+            arm = Arm((2, 5), 0.0, 1)
         for _ in range(programmes):
             data = mujoco.MjData(arm.model)
             arm.put_box(data)

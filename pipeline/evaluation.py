@@ -18,8 +18,8 @@ from pipeline.environments import Simulators, make_batch
 from pipeline.policy import Controller, GaussianPolicy
 from pipeline.seeding import Key, generator
 
-FILM_EVERY = 4
-"""Steps between frames; the environments run at 10 to 240 steps per second of simulated time."""
+FRAMES_PER_SECOND = 30
+"""Of a video, at most; the environments run at 10 to 240 steps per second of simulated time."""
 
 
 @dataclass(frozen=True)
@@ -84,14 +84,15 @@ def film(policy: GaussianPolicy, env_id: str, dynamics: Mapping[str, float], see
         arguments: dict[str, Any] = {"render_mode": "rgb_array", **dynamics}
         env = gymnasium.make(env_id, **arguments)
         observation, _ = env.reset(seed=seed)
+        every = max(1, env.metadata["render_fps"] // FRAMES_PER_SECOND)
         frames: list[Any] = []
         env_return, ended, step = 0.0, False, 0
         while not ended:
-            if step % FILM_EVERY == 0:
+            if step % every == 0:
                 frames.append(env.render())
             observation, reward, terminated, truncated, _ = env.step(policy.mean(observation[None])[0])
             env_return, ended, step = env_return + float(reward), terminated or truncated, step + 1
-        fps = env.metadata["render_fps"] / FILM_EVERY
+        fps = env.metadata["render_fps"] / every
         env.close()
         imageio.imwrite(path, np.stack(frames), fps=fps)
     except (ImportError, RuntimeError, AttributeError, mujoco.FatalError, gymnasium.error.Error) as error:

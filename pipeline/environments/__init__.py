@@ -12,15 +12,19 @@ import gymnasium
 from pipeline.environments.batch import Simulators, Snapshot
 from pipeline.environments.replay import ReplayBatch, refuse_randomness
 
-for _id, _class, _steps in (
-    ("oodil/Hopper-v0", "locomotion:HopperEnv", 1000),
-    ("oodil/Walker2d-v0", "locomotion:Walker2dEnv", 1000),
-    ("oodil/HalfCheetah-v0", "locomotion:HalfCheetahEnv", 1000),
-    ("oodil/Driving-v0", "driving:DrivingEnv", 1000),
-    ("oodil/Panda-v0", "panda:PandaEnv", 2000),
-):
+_OURS: tuple[tuple[str, str, int, dict[str, Any]], ...] = (
+    ("oodil/Hopper-v0", "locomotion:HopperEnv", 1000, {}),
+    ("oodil/Walker2d-v0", "locomotion:Walker2dEnv", 1000, {}),
+    ("oodil/HalfCheetah-v0", "locomotion:HalfCheetahEnv", 1000, {}),
+    ("oodil/Driving-v0", "driving:DrivingEnv", 1000, {}),
+    ("oodil/Panda-v0", "panda:PandaEnv", 2000, {}),
+    ("oodil/Panda20Hz-v0", "panda:PandaEnv", 166, {"frame_skip": 12}),
+)
+for _id, _class, _steps, _arguments in _OURS:
     if _id not in gymnasium.registry:
-        gymnasium.register(_id, entry_point=f"pipeline.environments.{_class}", max_episode_steps=_steps)
+        gymnasium.register(
+            _id, entry_point=f"pipeline.environments.{_class}", max_episode_steps=_steps, kwargs=_arguments
+        )
 
 
 def make_batch(env_id: str, dynamics: Mapping[str, float], num_simulators: int) -> Simulators:

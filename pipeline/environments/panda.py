@@ -46,10 +46,11 @@ def start_angles(working: tuple[int, ...]) -> dict[int, float]:
 class Arm:
     """A compiled arm with its table and box, and the rules of the task."""
 
-    def __init__(self, working: tuple[int, ...], spread: float) -> None:
+    def __init__(self, working: tuple[int, ...], spread: float, frame_skip: int) -> None:
         self.model = _compile(working)
         self.working = working
         self.spread = spread
+        self.frame_skip = frame_skip
         joints = [self.model.joint(_joint_name(n)) for n in working]
         self.angles = np.array([joint.qposadr[0] for joint in joints])
         """Where the working joints' angles are in ``qpos``."""
@@ -82,9 +83,10 @@ class Arm:
 
     def move(self, data: mujoco.MjData, action: NDArray[np.floating]) -> None:
         """Move the wanted angles by ``action`` (J,) in [-1, 1] rad/s for one control step."""
-        wanted = data.ctrl + np.clip(action, -1, 1) * TIME_STEP
-        data.ctrl[:] = np.minimum(np.maximum(wanted, self.low), self.high)
-        mujoco.mj_step(self.model, data)
+        turn = np.clip(action, -1, 1) * TIME_STEP
+        for _ in range(self.frame_skip):
+            data.ctrl[:] = np.minimum(np.maximum(data.ctrl + turn, self.low), self.high)
+            mujoco.mj_step(self.model, data)
         mujoco.mj_kinematics(self.model, data)
 
     def hand(self, data: mujoco.MjData) -> Floats:
@@ -113,7 +115,10 @@ def judge(observations: Floats) -> tuple[Floats, NDArray[np.bool_], NDArray[np.b
 
 
 class PandaEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
-    """One arm; of ``joint_1`` to ``joint_6`` each works (1) or is locked (0); starts vary by ``spread`` rad."""
+    """One arm; of ``joint_1`` to ``joint_6`` each works (1) or is locked (0); starts vary by ``spread`` rad.
+
+    A control step is ``frame_skip`` simulation steps of 1/240 s under the same action.
+    """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 240}  # noqa: RUF012  (Gymnasium's own form)
 
@@ -126,6 +131,7 @@ class PandaEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         joint_5: float = 1,
         joint_6: float = 1,
         spread: float = 0.2,
+        frame_skip: int = 1,
         render_mode: str | None = None,
     ) -> None:
         states = dict(zip(ALL_JOINTS, (joint_1, joint_2, joint_3, joint_4, joint_5, joint_6), strict=True))
@@ -136,7 +142,10 @@ class PandaEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
             raise ValueError("every joint is locked; at least one of joint_1 to joint_6 must be 1")
         if not 0 <= spread <= np.pi:
             raise ValueError(f"spread is {spread}; it must be between 0 and pi (rad)")
-        self.arm = Arm(tuple(number for number, state in states.items() if state), spread)
+        if frame_skip < 1 or frame_skip != int(frame_skip):
+            raise ValueError(f"frame_skip is {frame_skip}; it must be a whole number of simulation steps, at least 1")
+        self.arm = Arm(tuple(number for number, state in states.items() if state), spread, int(frame_skip))
+        self.metadata = self.metadata | {"render_fps": round(1 / TIME_STEP / frame_skip)}
         self.render_mode = render_mode
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(self.arm.working),), np.float32)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (6,), np.float64)
@@ -236,6 +245,7 @@ class Pusher:
 
     def __init__(self, batch: PandaBatch) -> None:
         self._batch = batch
+        self._control_step = TIME_STEP * batch.arm.frame_skip
         elbow_works = 4 in batch.arm.working
         self._behind = 0.3 if elbow_works else 0.2
         self._push = np.array([0.0, 0.0, 0.0 if elbow_works else 0.085])
@@ -256,7 +266,7 @@ class Pusher:
         # Damped least squares: https://en.wikipedia.org/wiki/Inverse_kinematics
         solved = np.linalg.solve(jacobian @ jacobian.T + self.DAMPING * np.eye(3), self.CARE * velocity)
         # The servos turn a joint by its distance to the wanted angle, per second.
-        return np.clip((angles + jacobian.T @ solved - wanted) / TIME_STEP, -1, 1)
+        return np.clip((angles + jacobian.T @ solved - wanted) / self._control_step, -1, 1)
 
 
 def _joint_name(number: int) -> str:

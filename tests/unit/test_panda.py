@@ -15,7 +15,7 @@ from pipeline.evaluation import run_episodes
 from pipeline.experts import hand_written
 from pipeline.seeding import generator
 
-ID = "oodil/Panda-v0"
+ID, SLOW_ID = "oodil/Panda-v0", "oodil/Panda20Hz-v0"
 ARMS = {"whole": (), "1": (1,), "3": (3,), "4": (4,), "6": (6,), "1, 3": (1, 3), "1, 3, 4": (1, 3, 4)}
 
 
@@ -24,13 +24,14 @@ def dynamics(locked: tuple[int, ...], spread: float = 0.2) -> dict[str, float]:
 
 
 @lru_cache
-def demonstrated(locked: tuple[int, ...]) -> list[Episode]:
-    arms = make_batch(ID, dynamics(locked), 6)
-    return run_episodes(arms, hand_written(arms, ID), generator((0,)), stochastic=False)
+def demonstrated(locked: tuple[int, ...], env_id: str = ID) -> list[Episode]:
+    arms = make_batch(env_id, dynamics(locked), 6)
+    return run_episodes(arms, hand_written(arms, env_id), generator((0,)), stochastic=False)
 
 
-def test_gymnasium_checker_passes() -> None:
-    check_env(gymnasium.make(ID, joint_1=0).unwrapped, skip_render_check=True)
+@pytest.mark.parametrize("env_id", [ID, SLOW_ID])
+def test_gymnasium_checker_passes(env_id: str) -> None:
+    check_env(gymnasium.make(env_id, joint_1=0).unwrapped, skip_render_check=True)
 
 
 @pytest.mark.parametrize("locked", ARMS.values(), ids=ARMS)
@@ -52,6 +53,18 @@ def test_batch_equals_gymnasium(locked: tuple[int, ...]) -> None:
             assert batch.observations().tobytes() == np.stack([s[0] for s in stepped]).tobytes()
             assert outcome.env_rewards.tolist() == [s[1] for s in stepped]
             assert outcome.terminated.tolist() == [s[2] for s in stepped]
+
+
+def test_a_slower_control_step_is_many_under_one_action() -> None:
+    fast, slow = make_batch(ID, dynamics((1, 3)), 2), make_batch(SLOW_ID, dynamics((1, 3)), 2)
+    for g in range(2):
+        fast.reset(g, g)
+        slow.reset(g, g)
+    for actions in np.random.default_rng(0).uniform(-1, 1, (20, 2, 4)):
+        for _ in range(12):
+            fast.step(actions)
+        slow.step(actions)
+        assert slow.observations().tobytes() == fast.observations().tobytes()
 
 
 def test_a_snapshot_continues_to_the_same_bits(assert_same_bits) -> None:
@@ -80,7 +93,7 @@ def relative_turn(arm: Arm, data: mujoco.MjData, number: int) -> np.ndarray:
 
 @pytest.mark.parametrize("locked", [(1, 3), (3,), (4,), (6,)])
 def test_locked_joints_stay_where_they_are(locked: tuple[int, ...]) -> None:
-    arm = Arm(tuple(number for number in ALL_JOINTS if number not in locked), 0.2)
+    arm = Arm(tuple(number for number in ALL_JOINTS if number not in locked), 0.2, 1)
     data = mujoco.MjData(arm.model)
     arm.start(data, np.random.default_rng(0))
     before = {number: relative_turn(arm, data, number) for number in range(1, 8)}
@@ -96,7 +109,7 @@ def test_locked_joints_stay_where_they_are(locked: tuple[int, ...]) -> None:
 def test_locked_links_are_where_the_joints_would_hold_them(working: tuple[int, ...]) -> None:
     angles = start_angles(working)
     hands = []
-    for arm in (Arm(ALL_JOINTS, 0.0), Arm(working, 0.0)):
+    for arm in (Arm(ALL_JOINTS, 0.0, 1), Arm(working, 0.0, 1)):
         data = mujoco.MjData(arm.model)
         data.qpos[arm.angles] = [angles[number] for number in arm.working]
         mujoco.mj_kinematics(arm.model, data)
@@ -106,7 +119,7 @@ def test_locked_links_are_where_the_joints_would_hold_them(working: tuple[int, .
 
 def test_the_servo_turns_a_joint_by_its_distance_to_the_wanted_angle() -> None:
     """Unit gain: of a step of the wanted angle, 1 - 1/e is done after one second."""
-    arm = Arm((2, 4, 5, 6), 0.0)
+    arm = Arm((2, 4, 5, 6), 0.0, 1)
     data = mujoco.MjData(arm.model)
     arm.start(data, np.random.default_rng(0))
     begin = data.qpos[arm.angles].copy()
@@ -118,9 +131,10 @@ def test_the_servo_turns_a_joint_by_its_distance_to_the_wanted_angle() -> None:
     np.testing.assert_allclose(done, 1 - np.exp(-1), rtol=0.02)
 
 
+@pytest.mark.parametrize("env_id", [ID, SLOW_ID])
 @pytest.mark.parametrize("locked", ARMS.values(), ids=ARMS)
-def test_the_demonstrator_pushes_the_box_to_the_goal(locked: tuple[int, ...]) -> None:
-    assert sum(episode.env_return > 900 for episode in demonstrated(locked)) >= 5
+def test_the_demonstrator_pushes_the_box_to_the_goal(locked: tuple[int, ...], env_id: str) -> None:
+    assert sum(episode.env_return > 900 for episode in demonstrated(locked, env_id)) >= 5
 
 
 def test_two_joints_are_not_enough() -> None:
@@ -157,6 +171,7 @@ def test_rewards_and_ends(hand_x: float, box: tuple[float, ...], reward: float, 
         ({"joint_1": 0.5}, "joint_1 is 0.5"),
         ({f"joint_{number}": 0 for number in ALL_JOINTS}, "every joint is locked"),
         ({"spread": -1.0}, "spread is -1.0"),
+        ({"frame_skip": 0.5}, "frame_skip is 0.5"),
     ],
 )
 def test_bad_dynamics_are_refused(wrong: dict[str, float], message: str) -> None:
