@@ -56,11 +56,10 @@ def _finding(results: Results) -> str:
         return ""
     text = f"The policy learned from weighted demonstrations returns <b>{pieces.returned(ours)}</b>"
     if naive is not None:
-        comparable = ours > 0 and naive > 0
-        text += f", {ours / naive:.1f} times" if comparable else ", against"
-        text += (
-            f" the {pieces.returned(naive)} of naive GAIL" if comparable else f" {pieces.returned(naive)} of naive GAIL"
-        )
+        # A ratio to next to nothing says nothing.
+        comparable = naive > 0 and 0 < ours / naive < 100
+        text += f", {ours / naive:.1f} times the" if comparable else ", against"
+        text += f" {pieces.returned(naive)} of naive GAIL"
     if oracle is not None:
         text += f"; the oracle, which is told what is transferable, reaches {pieces.returned(oracle)}"
     return text + "."
