@@ -285,6 +285,8 @@ class TransferabilityConfig(_Section):
     """Times the demonstrations are scored while a job runs, evenly spaced."""
     final_steps: PositiveInt = 200
     """Steps that the discriminator takes against the finished imitator, which no longer learns, before it is read."""
+    num_trainings: PositiveInt = 1
+    """Times an imitator of each cluster is trained, each with a seed of its own; the one that comes closest counts."""
     sharpening: float = Field(default=4.0, gt=0.0)
     """Power to which a transferability is raised to become a weight; 1 is the paper's form (docs/decisions.md)."""
 

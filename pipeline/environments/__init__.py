@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium
 
-from pipeline.environments.batch import Simulators, Snapshot
+from pipeline.environments.batch import Simulators, Snapshot, stop_the_clock
 from pipeline.environments.replay import ReplayBatch, refuse_randomness
 
 _OURS: tuple[tuple[str, str, int, dict[str, Any]], ...] = (
@@ -36,6 +36,7 @@ def make_batch(env_id: str, dynamics: Mapping[str, float], num_simulators: int) 
     Raises ValueError for an id that is not registered, dynamics that the environment does not have, an environment
     without a time limit, or spaces that are no boxes.
     """
+    stop_the_clock()
     try:
         arguments: dict[str, Any] = dict(dynamics)
         env = gymnasium.make(env_id, disable_env_checker=True, **arguments)

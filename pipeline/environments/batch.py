@@ -67,7 +67,7 @@ class Simulators(Protocol):
         """Continue from a snapshot of a batch of the same size and task."""
 
 
-def _stop_the_clock() -> None:
+def stop_the_clock() -> None:
     """Keep MuJoCo from timing itself: reading the clock for ``MjData.timer`` is a sixth of a step of Hopper.
 
     The clock is the whole process's, so one that somebody has set stays.
@@ -86,7 +86,6 @@ class MujocoBatch(ABC):
         self.num_simulators = num_simulators
         self.max_episode_steps = max_episode_steps
         self.action_dim = model.nu
-        _stop_the_clock()
         self._data = [mujoco.MjData(model) for _ in range(num_simulators)]
         self._elapsed = np.zeros(num_simulators, np.int64)
         self._returns = np.zeros(num_simulators)

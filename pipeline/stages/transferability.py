@@ -50,7 +50,7 @@ class ClusterJob:
         from pipeline.algorithms.learner import Learner
 
         environment, gail = run.config.environment, run.config.transferability.gail
-        members = np.flatnonzero(_labels(run) == int(job.removeprefix("cluster-")))
+        members = np.flatnonzero(_labels(run) == _cluster(job))
         demonstrations = load_demonstrations(run).select(members)
         seed = torch_seed(derive_key(run.config.seed, TransferabilityStage.name, job))
         simulators = make_batch(environment.id, environment.dynamics, 1)
@@ -91,7 +91,7 @@ def told_apart(config: RunConfig, scores: NDArray[np.float64], demonstrations: D
 
 
 class TransferabilityStage(Stage):
-    """K jobs, each with its own checkpoint and artifact; empty clusters have no job."""
+    """A job per cluster and training, each with its own checkpoint and artifact; empty clusters have none."""
 
     name = "transferability"
     version = 1
@@ -112,8 +112,10 @@ class TransferabilityStage(Stage):
         }
 
     def jobs(self, run: Run) -> list[str]:
-        """Return one job per cluster that has demonstrations, named by the cluster's id."""
-        return [f"cluster-{k}" for k in np.unique(_labels(run))]
+        """Return the jobs of each cluster that has demonstrations, named by the cluster's id."""
+        clusters = [f"cluster-{k}" for k in np.unique(_labels(run))]
+        again = range(2, run.config.transferability.num_trainings + 1)
+        return clusters + [f"{cluster}-training-{n}" for n in again for cluster in clusters]
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Imitate one cluster in the imitator's environment and score its demonstrations along the way."""
@@ -145,13 +147,16 @@ class TransferabilityStage(Stage):
         demonstrations = load_demonstrations(run)
         logits = np.full(len(demonstrations), np.nan)
         history = {}
+        trainings: dict[int, list[dict[str, np.ndarray]]] = {}
         for job in self.jobs(run):
-            arrays = run.job_artifact(self.name, job).arrays(_JOB_FILE)
-            logits[arrays["demonstrations"]] = arrays["logits"][-1]
-            cluster = job.replace("-", "_")
-            history[f"{cluster}/env_steps"] = arrays["env_steps"]
-            history[f"{cluster}/scores"] = transferability(arrays["logits"])
-            history[f"{cluster}/demonstrations"] = arrays["demonstrations"]
+            trainings.setdefault(_cluster(job), []).append(run.job_artifact(self.name, job).arrays(_JOB_FILE))
+        for cluster, trained in trainings.items():
+            # What one imitator can reproduce is transferable, whatever another made of it.
+            closest = min(trained, key=lambda arrays: float(arrays["logits"][-1].mean()))
+            logits[closest["demonstrations"]] = closest["logits"][-1]
+            history[f"cluster_{cluster}/env_steps"] = closest["env_steps"]
+            history[f"cluster_{cluster}/scores"] = transferability(closest["logits"])
+            history[f"cluster_{cluster}/demonstrations"] = closest["demonstrations"]
         horizon = make_batch(config.environment.id, config.environment.dynamics, 1).max_episode_steps
         scores = transferability(logits) * share_lasted(demonstrations, horizon)
         sharpening = config.transferability.sharpening
@@ -169,6 +174,10 @@ class TransferabilityStage(Stage):
             "history.safetensors": encode_arrays(history),
             "summary.json": encode_json(summary),
         }
+
+
+def _cluster(job: str) -> int:
+    return int(job.split("-")[1])
 
 
 def _labels(run: Run) -> np.ndarray:
