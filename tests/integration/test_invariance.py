@@ -3,8 +3,11 @@
 from pathlib import Path
 
 import gymnasium
+import numpy as np
 import pytest
+from safetensors.numpy import load_file
 
+from pipeline.algorithms.transferability import transferability
 from pipeline.environments.locomotion import HopperEnv
 from pipeline.loading import load_config
 from tests.runs import MICRO, artifacts, run
@@ -83,3 +86,19 @@ def test_a_reward_of_nan_trains_to_the_same_bits(inline: Path, tmp_path: Path, m
         assert poisoned.artifact(stage_name).hashes[file] == sound.artifact(stage_name).hashes[file]
     evaluation = poisoned.artifact("imitation").json("evaluation.json")
     assert evaluation["final_return"] is None
+
+
+def test_a_second_training_leaves_the_first_alone_and_the_closest_counts(inline: Path) -> None:
+    before = artifacts(inline)
+    run("run", str(MICRO), NAIVE, "transferability.num_trainings=2", "--run-dir", str(inline), "--workers", "0")
+    scores = load_file(inline / "stages" / "transferability" / "transferability.safetensors")["scores"]
+    jobs = inline / "jobs" / "transferability"
+    firsts = [path for path in jobs.iterdir() if "training" not in path.name]
+    assert firsts
+    for first in firsts:
+        trained = [load_file(path / "scores.safetensors") for path in (first, jobs / f"{first.name}-training-2")]
+        last = [transferability(training["logits"][-1]) for training in trained]
+        assert not np.array_equal(*last), "both had the same luck"
+        assert np.array_equal(scores[trained[0]["demonstrations"]], max(last, key=np.mean))
+    run("run", str(MICRO), NAIVE, "--run-dir", str(inline), "--workers", "0")
+    assert artifacts(inline) == before
