@@ -66,9 +66,7 @@ class Results:
     def env_steps(self) -> dict[str, int]:
         """Return the environment steps that each finished training took."""
         steps: dict[str, Any] = {stage: self.json(stage, "evaluation.json").get("env_steps") for stage in STAGES[3:]}
-        history = self.arrays("transferability", "history.safetensors")
-        jobs = [int(value[-1]) for name, value in history.items() if name.endswith("/env_steps") and len(value)]
-        steps["transferability"] = sum(jobs) or None
+        steps["transferability"] = self.json("transferability", "summary.json").get("env_steps")
         return {stage: steps[stage] for stage in STAGES if steps.get(stage) is not None}
 
     def seconds(self) -> dict[str, float]:

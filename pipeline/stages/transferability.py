@@ -163,6 +163,7 @@ class TransferabilityStage(Stage):
         weights = sharpened_weights(scores, sharpening)
         arrays = {"scores": scores, "weights": weights, "clusters": _labels(run)}
         summary: dict[str, Any] = {
+            "env_steps": sum(int(each["env_steps"][-1]) for trained in trainings.values() for each in trained),
             "sharpening": sharpening,
             "mean_score_by_source": {
                 label: float(scores[demonstrations.sources == i].mean())

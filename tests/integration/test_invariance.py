@@ -1,5 +1,6 @@
 """The result does not depend on who computed it, nor on the reward of the environment."""
 
+import json
 from pathlib import Path
 
 import gymnasium
@@ -93,6 +94,9 @@ def test_a_second_training_leaves_the_first_alone_and_the_closest_counts(inline:
     run("run", str(MICRO), NAIVE, "transferability.num_trainings=2", "--run-dir", str(inline), "--workers", "0")
     scores = load_file(inline / "stages" / "transferability" / "transferability.safetensors")["scores"]
     jobs = inline / "jobs" / "transferability"
+    every = [load_file(path / "scores.safetensors")["env_steps"][-1] for path in jobs.iterdir()]
+    summary = json.loads((inline / "stages" / "transferability" / "summary.json").read_text())
+    assert summary["env_steps"] == sum(every)
     firsts = [path for path in jobs.iterdir() if "training" not in path.name]
     assert firsts
     for first in firsts:

@@ -145,6 +145,7 @@ class Writer:
             "transferable_share_before": 0.0391,
             "mean_score_by_source": mean_scores,
             "sharpening": 1.0,
+            "env_steps": 5 * 1_500_000,
         }
         arrays = {"scores": scores, "weights": weights, "clusters": self.labels}
         self.write(
