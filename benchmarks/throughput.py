@@ -24,6 +24,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -64,6 +66,18 @@ IMITATION_SETUP = """\
   python benchmarks/throughput.py --imitation-python imitation-venv/bin/python"""
 
 
+@contextmanager
+def clock_as_shipped() -> Iterator[None]:
+    """Let MuJoCo time itself, as it does unless `make_batch` stops its clock."""
+    stopped = mujoco.get_mjcb_time()
+    mujoco.set_mjcb_time(None)
+    mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))  # where there is no clock, a new simulator brings one
+    try:
+        yield
+    finally:
+        mujoco.set_mjcb_time(stopped)
+
+
 class RawPhysics:
     """Simulators of one model that are stepped by ``mj_step`` and by nothing else.
 
@@ -85,18 +99,13 @@ class RawPhysics:
     def play(self, actions: NDArray[np.float32]) -> float:
         """Apply (T, G, A) actions and return the seconds of computation it took."""
         model, frame_skip, step = self._model, self._task.frame_skip, mujoco.mj_step
-        clock = mujoco.get_mjcb_time()
-        if self._as_shipped:
-            mujoco.set_mjcb_time(None)
-            mujoco.MjData(self._model)  # where there is no clock, a new simulator brings MuJoCo's own
-        started = time.process_time()
-        for action in actions:
-            for data, control, row in zip(self._data, self._controls, action, strict=True):
-                control[:] = row
-                step(model, data, frame_skip)
-        seconds = time.process_time() - started
-        mujoco.set_mjcb_time(clock)
-        return seconds
+        with clock_as_shipped() if self._as_shipped else nullcontext():
+            started = time.process_time()
+            for action in actions:
+                for data, control, row in zip(self._data, self._controls, action, strict=True):
+                    control[:] = row
+                    step(model, data, frame_skip)
+            return time.process_time() - started
 
     def states(self) -> NDArray[np.float64]:
         """Return (G, ...) integration states."""
