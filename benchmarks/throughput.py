@@ -242,26 +242,28 @@ def scaling(env_id: str, rounds: int) -> dict[str, Any]:
 
 
 def imitation(python: str, total_steps: int, rounds: int, workers: int) -> dict[str, Any]:
-    """Compare with the `imitation` library: GAIL, PPO, the same networks, batch, epochs and minibatches."""
-    groups, simulators = 4, 8
+    """Compare with the `imitation` library: GAIL, PPO, the same networks, batch, epochs and minibatches.
+
+    Beside it the loop as it is by default, whose networks and batch are the same, too, and whose generator is TRPO.
+    """
     generator = PpoConfig(epochs=IMITATION_EPOCHS, minibatch_size=IMITATION_MINIBATCH, learning_rate=3e-4)
+    default = run_config("oodil/Hopper-v0", total_steps)
+    assert default.imitation.gail.steps_per_iteration == IMITATION_BATCH
     config = run_config(
         "oodil/Hopper-v0",
         total_steps,
-        num_groups=groups,
-        simulators_per_group=simulators,
-        steps_per_rollout=IMITATION_BATCH // (groups * simulators),
         generator=generator.model_dump(),
         value={"epochs": IMITATION_EPOCHS, "minibatch_size": IMITATION_MINIBATCH},
     )
     peer_steps = total_steps // 4
     command = [python, str(ROOT / "benchmarks" / "peers" / "imitation_gail.py")]
     command += [str(value) for value in (peer_steps, IMITATION_BATCH, IMITATION_EPOCHS, IMITATION_MINIBATCH)]
-    theirs, inline, distributed = [], [], []
+    theirs, inline, distributed, by_default = [], [], [], []
     peer: dict[str, Any] = {}
     for _ in range(rounds):
         inline.append(learner_rate(config, 0)["steps_per_s"])
         distributed.append(learner_rate(config, workers)["steps_per_s"])
+        by_default.append(learner_rate(default, workers)["steps_per_s"])
         answer = subprocess.run(command, check=True, capture_output=True, text=True).stdout
         peer = json.loads(answer.splitlines()[-1])
         theirs.append(peer["steps_per_s"])
@@ -271,6 +273,8 @@ def imitation(python: str, total_steps: int, rounds: int, workers: int) -> dict[
         "workers_steps_per_s": statistics.median(distributed),
         "ratio_inline": statistics.median(a / b for a, b in zip(inline, theirs, strict=True)),
         "ratio_workers": statistics.median(a / b for a, b in zip(distributed, theirs, strict=True)),
+        "default_steps_per_s": statistics.median(by_default),
+        "ratio_default": statistics.median(a / b for a, b in zip(by_default, theirs, strict=True)),
         "workers": workers,
         "rounds": rounds,
         "imitation_versions": peer["versions"],
@@ -345,7 +349,8 @@ def main() -> None:
         print(
             f"imitation {figures['imitation_steps_per_s']:,.0f} /s; inline {figures['inline_steps_per_s']:,.0f} "
             f"({figures['ratio_inline']:.1f} times), 2 workers {figures['workers_steps_per_s']:,.0f} "
-            f"({figures['ratio_workers']:.1f} times)",
+            f"({figures['ratio_workers']:.1f} times); by default, with TRPO, {figures['default_steps_per_s']:,.0f} "
+            f"({figures['ratio_default']:.1f} times)",
             flush=True,
         )
     else:
