@@ -19,7 +19,7 @@ from pipeline.policy import Controller, GaussianPolicy
 from pipeline.seeding import Key, generator
 
 FRAMES_PER_SECOND = 30
-"""Of a video, at most; the environments run at 10 to 240 steps per second of simulated time."""
+"""Of a video, about, or as many as the environment has; the environments run at 10 to 240 steps per second of simulated time."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def film(policy: GaussianPolicy, env_id: str, dynamics: Mapping[str, float], see
         arguments: dict[str, Any] = {"render_mode": "rgb_array", **dynamics}
         env = gymnasium.make(env_id, **arguments)
         observation, _ = env.reset(seed=seed)
-        every = max(1, env.metadata["render_fps"] // FRAMES_PER_SECOND)
+        every = max(1, round(env.metadata["render_fps"] / FRAMES_PER_SECOND))
         frames: list[Any] = []
         env_return, ended, step = 0.0, False, 0
         while not ended:

@@ -276,6 +276,24 @@ def test_bad_environments_are_refused(env_id, dynamics, message):
         make_batch(env_id, dynamics, 1)
 
 
+def test_mujoco_does_not_time_itself():
+    """Without `make_batch` it does: a new simulator brings a clock."""
+    before = mujoco.get_mjcb_time()
+    durations = []
+    try:
+        mujoco.set_mjcb_time(None)
+        model = mujoco.MjModel.from_xml_string("<mujoco/>")
+        data = mujoco.MjData(model)
+        for _ in range(2):
+            mujoco.mj_resetData(model, data)
+            mujoco.mj_step(model, data, 100)
+            durations.append(data.timer[mujoco.mjtTimer.mjTIMER_STEP].duration)
+            make_batch("oodil/Hopper-v0", {}, 1)
+    finally:
+        mujoco.set_mjcb_time(before)
+    assert durations[0] > 0 and durations[1] == 0
+
+
 def test_a_clock_that_somebody_has_set_stays():
     """MuJoCo's clock belongs to the whole process; a batch stops it only if it is MuJoCo's own."""
     before = mujoco.get_mjcb_time()
