@@ -19,7 +19,7 @@ from pipeline.policy import Controller, GaussianPolicy
 from pipeline.seeding import Key, generator
 
 FRAMES_PER_SECOND = 30
-"""Of a video, about, or as many as the environment has; the environments run at 10 to 240 steps per second of simulated time."""
+"""Of a video, about; the environments run at 10 to 240 steps per second of simulated time."""
 
 
 @dataclass(frozen=True)
