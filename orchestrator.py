@@ -1,400 +1,215 @@
-"""The command line: ``oodil ...`` and ``python orchestrator.py ...`` are the same program.
+"""The run: its folder, and the walk over the stages that reuses, resumes or computes each.
 
-No mathematics and no sockets. Heavy imports follow argument parsing, so that ``--help`` answers at once.
+Stages say what is computed, an engine says where; here it is only decided what has to be done.
 """
 
+import fcntl
 import json
-import os
-import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Any
 
-import typer
-
-if TYPE_CHECKING:
-    from pipeline.config import RunConfig
-    from pipeline.stage import Run, Stage
-    from workers.engine import Engine
-
-# Before NumPy and torch are loaded: one compute thread per process, so that the bits do not depend on the machine.
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-EXIT_FAILED, EXIT_BAD_INPUT, EXIT_STOPPED = 1, 2, 130
-
-app = typer.Typer(
-    name="oodil",
-    help="Imitation learning from demonstrators whose dynamics differ from your robot's.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-demos_app = typer.Typer(help="Inspect and collect demonstrations.", no_args_is_help=True)
-app.add_typer(demos_app, name="demos")
-keys_app = typer.Typer(help="Keys for rollout workers on other machines.", no_args_is_help=True)
-app.add_typer(keys_app, name="keys")
-
-ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="A YAML file; configs/ has examples.")]
-Overrides = Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Fields to override.")]
-RunPath = Annotated[Path, typer.Argument(metavar="RUN_DIR", help="The folder of a run.")]
-Workers = Annotated[int | None, typer.Option("--workers", "-w", min=0, help="Parallel processes; 0 runs inline.")]
-Until = Annotated[str | None, typer.Option(help="Stop after this stage.")]
-Force = Annotated[str | None, typer.Option(help="Compute this stage again although it is finished.")]
-Bind = Annotated[str | None, typer.Option(help="Let workers of other machines join here, e.g. tcp://0.0.0.0:5555.")]
-Keys = Annotated[Path | None, typer.Option(help="Folder of keys, made by `oodil keys new`; --bind needs it.")]
-EngineName = Annotated[Literal["local", "ray"], typer.Option(help="This machine's processes, or a Ray cluster.")]
-TrustCluster = Annotated[bool, typer.Option("--trust-cluster", help="Use a Ray cluster that asks for no token.")]
+from oodil.pipeline.artifacts import Artifact, RunDirectory, read_artifact, remove_artifact, write_artifact, write_file
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.environments import check_environment
+from oodil.pipeline.errors import ConfigError, DamagedArtifactError, OodilError
+from oodil.pipeline.loading import parse_config
+from oodil.pipeline.results import Results, summary
+from oodil.pipeline.stage import Run, Stage, is_current
+from oodil.pipeline.stages import stages
+from oodil.pipeline.stages.demonstrations import check_demonstrations
+from oodil.pipeline.versions import library_versions
+from oodil.terminal import Display, stop_flag
+from oodil.workers.engine import Engine, Outcome
 
 
-@app.command()
-def run(
-    config_path: ConfigPath,
-    overrides: Overrides = None,
-    workers: Workers = None,
-    run_dir: Annotated[Path | None, typer.Option(help="Default: runs/NAME-seedSEED.")] = None,
-    until: Until = None,
-    force: Force = None,
-    bind: Bind = None,
-    keys: Keys = None,
-    engine: EngineName = "local",
-    trust_cluster: TrustCluster = False,
+class UnfinishedError(OodilError):
+    """A stage failed or was stopped; what was finished is kept."""
+
+    def __init__(self, stage: str, outcome: Outcome) -> None:
+        super().__init__(stage)
+        self.stage = stage
+        self.outcome = outcome
+
+
+def open_run(path: Path, config: RunConfig) -> Run:
+    """Create a run's folder, or accept one of the same run, and write the resolved configuration into it.
+
+    Raises ConfigError when the folder holds something else.
+    """
+    directory = RunDirectory(path)
+    if directory.config.exists():
+        held = read_run(path).config
+        for field in ("name", "seed", "environment"):
+            old, new = getattr(held, field), getattr(config, field)
+            if old != new:
+                raise ConfigError(
+                    f"{path}: holds a run with {field} {_short(old)}, not {_short(new)}; choose another --run-dir"
+                )
+    elif path.exists() and any(path.iterdir()):
+        raise ConfigError(f"{path}: is not empty and not a run; choose another --run-dir")
+    path.mkdir(parents=True, exist_ok=True)
+    write_file(directory.config, (config.model_dump_json(indent=2) + "\n").encode())
+    return Run(config, directory)
+
+
+def read_run(path: Path) -> Run:
+    """Return the run in a folder. Raises ConfigError if there is none."""
+    directory = RunDirectory(path)
+    if not directory.config.is_file():
+        raise ConfigError(f"{path}: is not a run (it has no {directory.config.name})")
+    return Run(parse_config(json.loads(directory.config.read_text()), str(directory.config)), directory)
+
+
+def check_inputs(config: RunConfig) -> None:
+    """Refuse, before any work, an environment that cannot be made and demonstrations that cannot fit it."""
+    simulators = check_environment(config.environment.id, config.environment.dynamics)
+    for name in ("transferability", "imitation"):
+        ignored = getattr(config, name).gail.discriminator.ignored
+        if not set(ignored) < set(range(simulators.observation_dim)):
+            raise ConfigError(
+                f"{name}.gail.discriminator.ignored is {list(ignored)}; states have the dimensions 0 to "
+                f"{simulators.observation_dim - 1}, of which at least one must be seen"
+            )
+    for source in config.demonstrations.sources:
+        check_environment(config.environment.id, source.dynamics)
+    check_demonstrations(config, simulators.observation_dim)
+
+
+def walk(run: Run, chosen: list[Stage], engine: Engine, force: str | None = None) -> None:
+    """Bring every chosen stage to its finished artifact. Raises UnfinishedError where that ends early."""
+    with _lock(run.directory), Display() as display, stop_flag(display.stopping) as should_stop:
+        _record(run.directory, "run_started", engine=str(engine), versions=library_versions())
+        for stage in chosen:
+            _bring_up(stage, run, engine, force == stage.name, display, should_stop)
+        _record(run.directory, "run_finished")
+
+
+def _bring_up(
+    stage: Stage,
+    run: Run,
+    engine: Engine,
+    forced: bool,
+    display: Display,
+    should_stop: Callable[[], bool],
 ) -> None:
-    """Run the pipeline; what is already finished is reused, what was interrupted goes on."""
-    with _bad_input():
-        from pipeline.loading import load_config
-
-        config = load_config(config_path, overrides)
-        from walk import check_inputs, open_run
-
-        check_inputs(config)
-        chosen = _engine(config, engine, workers, bind, keys, trust_cluster)
-        opened = open_run(run_dir or Path("runs") / f"{config.name}-seed{config.seed}", config)
-    _execute(opened, chosen, until, force)
-
-
-@app.command()
-def resume(
-    run_dir: RunPath,
-    workers: Workers = None,
-    until: Until = None,
-    force: Force = None,
-    bind: Bind = None,
-    keys: Keys = None,
-    engine: EngineName = "local",
-    trust_cluster: TrustCluster = False,
-) -> None:
-    """Go on with an interrupted run, with any number of workers or on another engine."""
-    from walk import check_inputs, read_run
-
-    with _bad_input():
-        opened = read_run(run_dir)
-        check_inputs(opened.config)
-        chosen = _engine(opened.config, engine, workers, bind, keys, trust_cluster)
-    _execute(opened, chosen, until, force)
+    origin, path = stage.origin(run), run.directory.stage(stage.name)
+    found, reason = _inspect(path, origin)
+    if found is not None and not forced:
+        display.reused(stage.name)
+        return
+    started = time.monotonic()
+    pending = _pending(stage, run, forced)
+    resumed = [job for job in pending if stage.checkpoints(run, job).exist()]
+    if forced:
+        reason = "computed again as asked"
+    elif resumed:
+        reason = "resumed from checkpoint" + ("" if resumed == [stage.name] else f" ({', '.join(resumed)})")
+    display.stage_started(stage.name, reason, len(pending))
+    _record(run.directory, "stage_started", stage=stage.name, reason=reason, jobs=len(pending))
+    outcome = engine.run_jobs(stage, run, pending, display.event, should_stop)
+    if outcome.stopped or outcome.failed:
+        _record(run.directory, "stage_interrupted", stage=stage.name, seconds=time.monotonic() - started)
+        raise UnfinishedError(stage.name, outcome)
+    files = stage.combine(run)
+    if files is not None:
+        write_artifact(path, origin, files, library_versions())
+    seconds = time.monotonic() - started
+    _record(run.directory, "stage_finished", stage=stage.name, seconds=seconds)
+    display.stage_finished(stage.name, seconds)
 
 
-@app.command()
-def worker(
-    connect: Annotated[str, typer.Option(help="Address of a run started with --bind, e.g. tcp://lab-server:5555.")],
-    keys: Annotated[Path, typer.Option(help="This machine's folder of keys, made beside the run by `oodil keys new`.")],
-    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 1,
-    logs: Annotated[Path, typer.Option(help="Folder for their logs.")] = Path("worker-logs"),
-) -> None:
-    """Collect rollouts for a run on another machine, until Ctrl-C; come and go as you like."""
-    from terminal import stop_flag
-    from workers.keys import client_keys
-    from workers.remote import WorkersError, serve
+def _pending(stage: Stage, run: Run, forced: bool) -> list[str]:
+    """Return the jobs whose artifacts are not current, and clear away what is in their place."""
+    pending = []
+    for job in stage.jobs(run):
+        path = run.directory.job(stage.name, job)
+        if forced:
+            stage.checkpoints(run, job).clear()
+        if forced or _inspect(path, stage.job_origin(run, job))[0] is None:
+            remove_artifact(path)
+            pending.append(job)
+    return pending
 
-    with _bad_input():
-        client_keys(keys)
-    with stop_flag(lambda: print("stopping")) as should_stop:
+
+def _inspect(path: Path, origin: dict[str, Any]) -> tuple[Artifact | None, str]:
+    """Return a current, undamaged artifact, or None and the reason to compute it."""
+    try:
+        artifact = read_artifact(path)
+        if artifact is None:
+            return None, ""
+        if not is_current(artifact, origin):
+            return None, f"recomputed: {_difference(artifact.origin, origin)}"
+        artifact.verify()
+    except DamagedArtifactError as error:
+        return None, f"recomputed: {error}"
+    return artifact, ""
+
+
+def _difference(old: Any, new: Any, key: str = "") -> str:
+    """Name the first place where two origins differ, as ``key old -> new``."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for name in sorted({*old, *new}):
+            if old.get(name) != new.get(name):
+                return _difference(old.get(name), new.get(name), f"{key}.{name}" if key else name)
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for i, (a, b) in enumerate(zip(old, new, strict=True)):
+            if a != b:
+                return _difference(a, b, f"{key}[{i}]")
+    if key.startswith("inputs."):
+        return f"its input {key.removeprefix('inputs.')} changed"
+    return f"{key.removeprefix('settings.')} {old!r} -> {new!r}"
+
+
+def describe(run: Run) -> dict[str, Any]:
+    """Return the state of every stage and the results known so far, as JSON values."""
+    seconds = Results(run).seconds()
+    described = {}
+    for stage in stages(run.config):
+        entry: dict[str, Any] = {"state": "pending", "sha256": None}
         try:
-            serve(connect, keys, workers, logs, print, should_stop)
-        except WorkersError as error:
-            print(f"oodil: {error}", file=sys.stderr)
-            raise typer.Exit(EXIT_FAILED) from None
-
-
-@keys_app.command("new")
-def new_keys(
-    folder: Annotated[Path, typer.Argument(metavar="KEYS", help="The folder of the learner's keys.")],
-    worker: Annotated[str | None, typer.Option(help="Allow one more machine, and make its keys.")] = None,
-) -> None:
-    """Make the learner's keys, or with --worker those of a machine that may join."""
-    from workers.channels import new_key_pair
-    from workers.keys import create_learner_keys, create_worker_keys
-
-    with _bad_input():
-        if worker is None:
-            create_learner_keys(folder, new_key_pair)
-            print(f"{folder}: the learner's keys; allow a machine with: oodil keys new {folder} --worker NAME")
-        else:
-            own = create_worker_keys(folder, worker, new_key_pair)
-            print(f"{own}: copy this folder to the machine, by a way that nobody else can read, and remove it here")
-
-
-@app.command()
-def status(run_dir: RunPath, as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False) -> None:
-    """Say which stages are finished and what is known so far."""
-    from terminal import print_status
-    from walk import describe, read_run
-
-    with _bad_input():
-        described = describe(read_run(run_dir))
-    if as_json:
-        print(json.dumps(described, indent=2))
-    else:
-        print_status(described)
-
-
-@app.command()
-def report(run_dir: RunPath) -> None:
-    """Write the report anew, of whatever is finished."""
-    from pipeline.report import write_report
-    from walk import read_run
-
-    with _bad_input():
-        opened = read_run(run_dir)
-    print(write_report(opened))
-
-
-@app.command()
-def evaluate(
-    run_dir: RunPath,
-    episodes: Annotated[int, typer.Option(min=1, help="Deterministic episodes.")] = 32,
-    stage: Annotated[str, typer.Option(help="Whose policy: imitation, naive_gail or oracle.")] = "imitation",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the episodes.")] = 0,
-    video: Annotated[bool, typer.Option("--video", help="Also film one episode.")] = False,
-) -> None:
-    """Evaluate a trained policy on the true return of the imitator's environment."""
-    from pipeline.evaluation import evaluate as evaluate_policy
-    from pipeline.evaluation import film
-    from pipeline.policy import GaussianPolicy
-    from pipeline.seeding import derive_key
-    from walk import read_run
-
-    with _bad_input():
-        opened = read_run(run_dir)
-        policy = GaussianPolicy.from_arrays(opened.artifact(stage).arrays("policy.safetensors"))
-    environment = opened.config.environment
-    seen = evaluate_policy(policy, environment.id, environment.dynamics, episodes, derive_key(seed, "evaluate"))
-    print(
-        f"{stage}: return {seen.returns.mean():.1f} ± {seen.returns.std():.1f}, "
-        f"length {seen.lengths.mean():.0f}, {episodes} deterministic episodes, seed {seed}"
-    )
-    if video:
-        path = opened.directory.path / f"{stage}.mp4"
-        with _bad_input():
-            env_return = film(policy, environment.id, environment.dynamics, seed, path)
-        print(f"{path}: one episode, return {env_return:.1f}")
-
-
-@app.command()
-def bench(
-    config_path: ConfigPath,
-    overrides: Overrides = None,
-    workers: Annotated[list[int] | None, typer.Option("--workers", "-w", min=0, help="Repeat for several.")] = None,
-) -> None:
-    """Find the number of workers with which the learner is fastest here; takes about a minute."""
-    from bench import compare, worker_counts
-    from pipeline.loading import load_config
-    from terminal import print_bench
-    from walk import check_inputs
-
-    with _bad_input():
-        config = load_config(config_path, overrides)
-        check_inputs(config)
-
-    def show(count: int, figures: dict[str, float]) -> None:
-        print(f"{count} workers: {figures['steps_per_s']:,.0f} environment steps per second", file=sys.stderr)
-
-    print_bench(config.environment.id, compare(config, sorted(set(workers or worker_counts())), show))
-
-
-@demos_app.command("inspect")
-def inspect_demos(path: Annotated[Path, typer.Argument(help="A file of demonstrations, or a run's folder.")]) -> None:
-    """Show what a set of demonstrations contains."""
-    from pipeline.datasets import read_demonstrations
-    from terminal import print_demonstrations
-    from walk import read_run
-
-    with _bad_input():
-        file = path
-        if path.is_dir():
-            file = read_run(path).artifact("demonstrations").path / "demonstrations.safetensors"
-        demonstrations, environment = read_demonstrations(file)
-    print_demonstrations(file, demonstrations, environment)
-
-
-@demos_app.command("collect")
-def collect_demos(
-    config_path: ConfigPath,
-    overrides: Overrides = None,
-    train: Annotated[bool, typer.Option("--train", help="First train the experts anew, and save them.")] = False,
-    output: Annotated[Path, typer.Option(help="The file to write.")] = Path("demonstrations.safetensors"),
-    workers: Workers = None,
-) -> None:
-    """Collect demonstrations from the experts of a configuration into one file; interrupted, it goes on."""
-    from pipeline.loading import load_config
-    from pipeline.stages import stages
-    from pipeline.stages.experts import ExpertsStage
-    from walk import check_inputs, open_run
-
-    with _bad_input():
-        config = load_config(config_path, overrides)
-        if not train:
-            check_inputs(config)
-        engine = _engine(config, "local", workers)
-        opened = open_run(output.with_name(f".{output.name}.run"), config)
-    if train:
-        experts = ExpertsStage()
-        _walk(opened, [experts], engine, None)
-        print("\n".join(experts.export(opened)))
-    _walk(opened, stages(config)[:1], engine, None)
-    output.write_bytes(opened.artifact("demonstrations").read("demonstrations.safetensors"))
-    inspect_demos(output)
-
-
-@demos_app.command("convert")
-def convert_demos(
-    sources: Annotated[
-        list[str],
-        typer.Argument(help="FILE.npz, FILE.hdf5 (robomimic), FILE.pkl (released code) or minari:DATASET_ID."),
-    ],
-    environment: Annotated[str, typer.Option(help="Id of the imitator's environment, such as oodil/Hopper-v0.")],
-    output: Annotated[Path, typer.Option(help="The file to write.")] = Path("demonstrations.safetensors"),
-    keys: Annotated[
-        str, typer.Option(help="For observations with several entries: those that make up a state, joined by commas.")
-    ] = "",
-    ends_are_failures: Annotated[
-        bool, typer.Option(help="Episodes that the environment ended are ones in which the demonstrator failed.")
-    ] = False,
-) -> None:
-    """Make one file of demonstrations from files in other formats; each becomes a source, named by its file."""
-    from pipeline.data import Demonstrations
-    from pipeline.datasets import encode_demonstrations
-    from pipeline.datasets.foreign import read_foreign
-
-    parts = []
-    with _bad_input():
-        for source in sources:
-            label = source if source.startswith("minari:") else Path(source).stem
-            chosen = tuple(key for key in keys.split(",") if key)
-            part, recorded = read_foreign(source, label, chosen, ends_are_failures)
-            print(f"{source}: {len(part)} demonstrations" + (f" from {recorded}" if recorded else ""))
-            parts.append(part)
-        output.write_bytes(encode_demonstrations(Demonstrations.joined(parts), environment))
-    inspect_demos(output)
-
-
-@demos_app.command("export")
-def export_demos(
-    run_dir: RunPath,
-    target: Annotated[str, typer.Argument(help="FILE.csv, FILE.hdf5 (robomimic) or minari:DATASET_ID.")],
-) -> None:
-    """Write cluster, transferability and weight of every demonstration to a table, or to where they came from."""
-    from pipeline.datasets.export import export
-    from pipeline.stages.demonstrations import load_demonstrations
-    from walk import read_run
-
-    with _bad_input():
-        opened = read_run(run_dir)
-        arrays = opened.artifact("transferability").arrays("transferability.safetensors")
-        columns = {"cluster": "clusters", "transferability": "scores", "weight": "weights"}
-        found = {name: arrays[held] for name, held in columns.items()}
-        print(export(load_demonstrations(opened), found, target))
-
-
-def _engine(
-    config: "RunConfig",
-    name: str,
-    workers: int | None,
-    bind: str | None = None,
-    keys: Path | None = None,
-    trust_cluster: bool = False,
-) -> "Engine":
-    """Return where jobs run; refuse options that belong to another engine."""
-    if name == "local":
-        from workers.channels import open_access
-        from workers.engine import LocalEngine
-
-        if trust_cluster:
-            raise ValueError("--trust-cluster belongs to --engine ray")
-        count = config.runtime.workers if workers is None else workers
-        if bind is not None and count == 0:
-            raise ValueError("--bind needs a learner process; --workers 0 runs everything in one")
-        return LocalEngine(count, access=open_access(bind, keys))
-    if (workers, bind, keys) != (None, None, None):
-        raise ValueError("--workers, --bind and --keys belong to --engine local; a Ray cluster has its own workers")
-    try:
-        from workers.cluster import RayEngine, connect
-    except ImportError as error:
-        raise ValueError(f"--engine ray needs Ray (pip install 'oodil[ray]'): {error}") from None
-    connect(trust_cluster)
-    return RayEngine()
-
-
-def _execute(opened: "Run", engine: "Engine", until: str | None, force: str | None) -> None:
-    """Walk the stages, then write the report and print the summary."""
-    from pipeline.report import write_report
-    from pipeline.results import summary
-    from pipeline.stages import stages
-    from terminal import print_summary
-
-    chosen = stages(opened.config)
-    names = [stage.name for stage in chosen]
-    with _bad_input():
-        for name in (until, force):
-            if name is not None and name not in names:
-                raise ValueError(f"no stage {name!r}; this run has {', '.join(names)}")
-    try:
-        _walk(opened, chosen[: names.index(until or names[-1]) + 1], engine, force)
-    finally:
-        path = write_report(opened)
-    print_summary(summary(opened), path)
-
-
-def _walk(opened: "Run", chosen: list["Stage"], engine: "Engine", force: str | None) -> None:
-    from pipeline.loading import ConfigError
-    from walk import UnfinishedError, walk
-
-    try:
-        walk(opened, chosen, engine, force)
-    except ConfigError as error:
-        print(f"oodil: {error}", file=sys.stderr)
-        raise typer.Exit(EXIT_BAD_INPUT) from None
-    except UnfinishedError as unfinished:
-        outcome = unfinished.outcome
-        for job, traceback in outcome.failed.items():
-            print(f"\n{unfinished.stage}/{job} failed:\n{traceback}", file=sys.stderr)
-        print(
-            f"\n{unfinished.stage}: {len(outcome.done)} jobs done, {len(outcome.failed)} failed, "
-            f"{len(outcome.not_run)} not finished. What is finished is kept; go on with: "
-            f"oodil resume {opened.directory.path}",
-            file=sys.stderr,
-        )
-        raise typer.Exit(EXIT_FAILED if outcome.failed else EXIT_STOPPED) from None
-    except KeyboardInterrupt:
-        print(f"\nstopped at once; go on with: oodil resume {opened.directory.path}", file=sys.stderr)
-        raise typer.Exit(EXIT_STOPPED) from None
+            artifact = read_artifact(run.directory.stage(stage.name))
+            if artifact is not None:
+                artifact.verify()
+                entry = {"state": "done", "sha256": artifact.sha256}
+            elif run.directory.has_begun(stage.name):
+                entry["state"] = "partial"
+        except DamagedArtifactError as error:
+            entry = {"state": "damaged", "sha256": None, "reason": str(error)}
+        described[stage.name] = entry | ({"seconds": round(seconds[stage.name], 1)} if stage.name in seconds else {})
+    return {
+        "run": str(run.directory.path),
+        "name": run.config.name,
+        "seed": run.config.seed,
+        "stages": described,
+        "results": summary(run),
+    }
 
 
 @contextmanager
-def _bad_input() -> Iterator[None]:
-    """Print what is wrong with the user's input in one message and exit with code 2."""
-    try:
+def _lock(directory: RunDirectory) -> Iterator[None]:
+    """Hold the run for this process; the lock goes with the process, however it ends."""
+    with open(directory.path / ".lock", "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise ConfigError(f"{directory.path}: another process is working on this run") from None
         yield
-    except (ValueError, LookupError, OSError) as error:
-        print(f"oodil: {error}", file=sys.stderr)
-        raise typer.Exit(EXIT_BAD_INPUT) from None
 
 
-def main() -> None:
-    """Entry point of the ``oodil`` command."""
-    app()
+def _record(directory: RunDirectory, event: str, **fields: Any) -> None:
+    """Append to the run's log, the place for times, worker counts and everything else that varies."""
+    with open(directory.events, "a") as file:
+        file.write(json.dumps({"time": time.time(), "event": event, **fields}) + "\n")
+
+
+def _short(value: Any) -> str:
+    return json.dumps(value.model_dump() if hasattr(value, "model_dump") else value)
 
 
 if __name__ == "__main__":
+    from oodil.cli import main
+
     main()

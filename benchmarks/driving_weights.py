@@ -22,16 +22,16 @@ from sklearn.metrics import roc_auc_score
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from pipeline.algorithms.transferability import sampling_mass
-from pipeline.data import Demonstrations
-from pipeline.environments import make_batch
-from pipeline.environments.driving import GOAL, HEIGHT, STEP_REWARD, WIDTH, Layout, layout, touches
-from pipeline.evaluation import run_episodes
-from pipeline.policy import GaussianPolicy
-from pipeline.seeding import derive_key, generator
-from pipeline.stage import Run
-from pipeline.stages.demonstrations import load_demonstrations
-from walk import read_run
+from oodil.orchestrator import read_run
+from oodil.pipeline.algorithms.weights import sampling_mass
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.environments.driving import GOAL, HEIGHT, STEP_REWARD, WIDTH, Layout, layout, touches
+from oodil.pipeline.evaluation import run_episodes
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.seeding import derive_key, numpy_rng
+from oodil.pipeline.stage import Run
+from oodil.pipeline.stages.demonstrations import load_demonstrations
 
 POLICIES = {"imitation": "ours", "naive_gail": "naive GAIL", "oracle": "oracle"}
 
@@ -59,9 +59,9 @@ def draw(demonstrations: Demonstrations, scores: NDArray[np.float64], world: Lay
     for i, (axes, title) in enumerate(zip(panels, titles, strict=True)):
         axes.set_title(title, fontsize=9)
         axes.set(xlim=(0, WIDTH), ylim=(0, HEIGHT), aspect="equal", xlabel="m")
-        for box, colour in ((GOAL, "#2f7d4f"), *((box, "#cf4f1b") for box in world.obstacles)):
+        for box, color in ((GOAL, "#2f7d4f"), *((box, "#cf4f1b") for box in world.obstacles)):
             corner = box.left, box.y - box.depth / 2
-            axes.add_patch(Rectangle(corner, box.width, box.depth, color=colour, alpha=0.55, linewidth=0, zorder=3))
+            axes.add_patch(Rectangle(corner, box.width, box.depth, color=color, alpha=0.55, linewidth=0, zorder=3))
         mine = np.flatnonzero(demonstrations.sources == i)
         mine = mine[np.argsort(scores[mine], kind="stable")]  # the darkest on top
         lines = LineCollection([paths[n] for n in mine], array=scores[mine], cmap=shades, norm=depth, linewidths=0.8)
@@ -99,7 +99,7 @@ def drive(run: Run, stage: str, num_episodes: int) -> str:
     environment = run.config.environment
     policy = GaussianPolicy.from_arrays(run.artifact(stage).arrays("policy.safetensors"))
     cars = make_batch(environment.id, environment.dynamics, num_episodes)
-    episodes = run_episodes(cars, policy, generator(derive_key(run.config.seed, "benchmark")), stochastic=False)
+    episodes = run_episodes(cars, policy, numpy_rng(derive_key(run.config.seed, "benchmark")), stochastic=False)
     returns = np.array([episode.env_return for episode in episodes])
     steps = np.array([len(episode.states) - 1 for episode in episodes])
     third = np.array([(episode.states[0, 0] / 2 + 0.5) * WIDTH // 25 for episode in episodes])

@@ -25,8 +25,8 @@ import gymnasium
 import numpy as np
 
 from benchmarks.throughput import clock_as_shipped, machine
-from pipeline.environments import make_batch
-from pipeline.versions import library_versions
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.versions import library_versions
 
 SIMULATORS = 32
 STEPS = 100

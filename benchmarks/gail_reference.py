@@ -2,8 +2,8 @@
 
 For every seed: environment steps and seconds until the deterministic policy first reaches a return of 2,900, and the
 return at the end of the budget. Run ``python benchmarks/gail_reference.py --json FILE``; ``--setting official`` takes
-the constants of the method's released code instead of the defaults, ``ppo`` the other generator, ``wide`` and ``cheap``
-what would be faster per step.
+the constants of the method's released code instead of the defaults, ``ppo`` the other policy optimizer,
+``wide`` and ``cheap`` what would be faster per step.
 """
 
 import argparse
@@ -25,16 +25,16 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np  # noqa: E402
 
 from benchmarks.throughput import machine  # noqa: E402
-from pipeline.algorithms.gail import AdversarialReward  # noqa: E402
-from pipeline.algorithms.learner import Learner  # noqa: E402
-from pipeline.artifacts import Checkpoints  # noqa: E402
-from pipeline.config import EnvironmentConfig, GailConfig  # noqa: E402
-from pipeline.evaluation import evaluate  # noqa: E402
-from pipeline.experts import collect_demonstrations, load_expert  # noqa: E402
-from pipeline.rollout import InlineRollouts  # noqa: E402
-from pipeline.seeding import derive_key  # noqa: E402
-from pipeline.training import Probe, train  # noqa: E402
-from pipeline.versions import library_versions  # noqa: E402
+from oodil.pipeline.algorithms.gail import AdversarialReward  # noqa: E402
+from oodil.pipeline.algorithms.learner import Learner  # noqa: E402
+from oodil.pipeline.artifacts import Checkpoints  # noqa: E402
+from oodil.pipeline.collecting import InlineRollouts  # noqa: E402
+from oodil.pipeline.config import EnvironmentConfig, GailConfig  # noqa: E402
+from oodil.pipeline.evaluation import evaluate  # noqa: E402
+from oodil.pipeline.experts import collect_demonstrations, load_expert  # noqa: E402
+from oodil.pipeline.seeding import derive_key  # noqa: E402
+from oodil.pipeline.training import Probe, train  # noqa: E402
+from oodil.pipeline.versions import library_versions  # noqa: E402
 
 ENV_ID = "oodil/Hopper-v0"
 EXPERT = Path(__file__).parents[1] / "configs" / "experts" / "hopper-gravity-9.8"
@@ -44,18 +44,18 @@ EVALUATION_INTERVAL = 50_000
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
     "official": {
-        "normalise_observations": False,
-        "generator": {"fisher_every": 1},
+        "normalize_observations": False,
+        "policy_optimizer": {"fisher_every": 1},
         "value": {"learning_rate": 3e-4, "epochs": 1, "minibatch_size": 86},
         "anneal": False,
         "lag": 0,
     },
-    "ppo": {"generator": {"kind": "ppo"}},
+    "ppo": {"policy_optimizer": {"kind": "ppo"}},
     "wide": {"simulators_per_group": 16, "steps_per_rollout": 40},
     "cheap": {
         "simulators_per_group": 16,
         "steps_per_rollout": 40,
-        "generator": {"fisher_every": 8},
+        "policy_optimizer": {"fisher_every": 8},
         "value": {"epochs": 2},
     },
 }
@@ -100,7 +100,7 @@ def run_seed(seed: int, config: GailConfig) -> dict[str, Any]:
         nonlocal evaluating
         begun = time.perf_counter()
         seconds.append(begun - started - evaluating)
-        seen = evaluate(learner.behaviour_policy(), ENV_ID, IMITATOR, 8, derive_key(seed, "benchmark"))
+        seen = evaluate(learner.behavior_policy(), ENV_ID, IMITATOR, 8, derive_key(seed, "benchmark"))
         evaluating += time.perf_counter() - begun
         return seen.returns.mean()
 

@@ -28,17 +28,18 @@ sys.path.insert(0, str(ROOT))
 
 import torch
 
-from bench import random_demonstrations
 from benchmarks.throughput import machine, run_config
-from pipeline.algorithms.gail import AdversarialReward
-from pipeline.algorithms.learner import Learner
-from pipeline.environments import make_batch
-from pipeline.rollout import Unit, UnitResult, collect
-from pipeline.seeding import derive_key
-from pipeline.versions import collecting_versions, library_versions
-from workers.channels import Dealer, private_endpoint
-from workers.learner import ZmqRollouts
-from workers.messages import Header, Ready, ResultMessage, UnitMessage, decode, encode
+from oodil.bench import random_demonstrations
+from oodil.pipeline.algorithms.gail import AdversarialReward
+from oodil.pipeline.algorithms.learner import Learner
+from oodil.pipeline.collecting import collect
+from oodil.pipeline.data import Unit, UnitResult
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.seeding import derive_key
+from oodil.pipeline.versions import collecting_versions, library_versions
+from oodil.workers.channels import Dealer, private_endpoint
+from oodil.workers.messages import Header, Ready, ResultMessage, UnitMessage, decode, encode
+from oodil.workers.zmq_rollouts import ZmqRollouts
 
 UNITS_PER_WORKER = 4
 """In one iteration, so that no worker ever waits for the learner to begin the next."""
@@ -72,7 +73,7 @@ def real_costs(env_id: str) -> tuple[dict[str, float], Unit, UnitResult]:
                 num_simulators=gail.simulators_per_group,
                 num_steps=gail.steps_per_rollout,
                 policy_version=iteration,
-                policy=learner.behaviour_policy(),
+                policy=learner.behavior_policy(),
                 key=derive_key(0, "rollout", group, iteration),
                 snapshot=snapshots[group],
             )

@@ -27,16 +27,16 @@ from numpy.typing import NDArray
 
 from benchmarks.gail_reference import Quiet
 from benchmarks.throughput import machine
-from pipeline.algorithms.transferability import share_lasted, transferability
-from pipeline.artifacts import Checkpoints
-from pipeline.environments import make_batch
-from pipeline.evaluation import evaluate
-from pipeline.seeding import derive_key
-from pipeline.stages.demonstrations import load_demonstrations
-from pipeline.stages.transferability import ClusterJob, TransferabilityStage, told_apart
-from pipeline.training import Probe, train
-from pipeline.versions import library_versions
-from walk import read_run
+from oodil.orchestrator import read_run
+from oodil.pipeline.algorithms.weights import share_lasted, transferability
+from oodil.pipeline.artifacts import Checkpoints
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.evaluation import evaluate
+from oodil.pipeline.seeding import derive_key
+from oodil.pipeline.stages.demonstrations import load_demonstrations
+from oodil.pipeline.stages.transferability import ClusterJob, TransferabilityStage, told_apart
+from oodil.pipeline.training import Probe, train
+from oodil.pipeline.versions import library_versions
 
 READINGS = 10
 
@@ -56,7 +56,7 @@ def train_job(run_dir: Path, name: str) -> dict[str, NDArray]:
         return logits
 
     def true_return() -> NDArray[np.float64]:
-        policy, key = job.learner.behaviour_policy(), derive_key(job.seed, "budget")
+        policy, key = job.learner.behavior_policy(), derive_key(job.seed, "budget")
         seen = evaluate(policy, environment.id, environment.dynamics, 8, key)
         return np.asarray(seen.returns.mean())
 

@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.throughput import machine
-from pipeline.environments import make_batch, panda
-from pipeline.environments.panda import ALL_JOINTS, BOX_START, TIME_STEP, Arm, Floats
-from pipeline.evaluation import run_episodes
-from pipeline.experts import hand_written
-from pipeline.seeding import generator
-from pipeline.versions import library_versions
+from oodil.pipeline.environments import make_batch, panda
+from oodil.pipeline.environments.panda import ALL_JOINTS, BOX_START, TIME_STEP, Arm, Floats
+from oodil.pipeline.evaluation import run_episodes
+from oodil.pipeline.experts import hand_written
+from oodil.pipeline.seeding import numpy_rng
+from oodil.pipeline.versions import library_versions
 
 ENV_ID = "oodil/Panda-v0"
 FOLLOWED_BY = {(1, 3): [(1, 3), (1,), (), (6,), (4,)], (1, 3, 4): [(1, 3), (4,)]}
@@ -78,7 +78,7 @@ def follow_all(episodes: int) -> list[dict[str, Any]]:
         arm = Arm(tuple(number for number in ALL_JOINTS if number not in imitator), 0.2, 1)
         for locked in demonstrators:
             batch = make_batch(ENV_ID, {f"joint_{number}": 0.0 for number in locked}, episodes)
-            seen = run_episodes(batch, hand_written(batch, ENV_ID), generator((0,)), stochastic=False)
+            seen = run_episodes(batch, hand_written(batch, ENV_ID), numpy_rng((0,)), stochastic=False)
             kept = [episode.states for episode in seen if episode.env_return > 500]
             errors, short = np.array([follow(arm, states) for states in kept]).T
             row = {

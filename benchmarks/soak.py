@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.throughput import machine
-from pipeline.versions import library_versions
+from oodil.pipeline.versions import library_versions
 
 WARM_UP = 0.15
 """Share of the time that is not judged: libraries load, caches and the lists of the progress display fill."""

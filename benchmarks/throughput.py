@@ -39,18 +39,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bench import learner_rate
-from pipeline.algorithms.networks import PolicyNetwork
-from pipeline.config import EnvironmentConfig, PpoConfig, RunConfig
-from pipeline.environments import Snapshot, make_batch
-from pipeline.environments.batch import STATE
-from pipeline.loading import parse_config
-from pipeline.training import experience
-from pipeline.versions import library_versions
-from workers import rollout as rollout_process
-from workers.channels import private_endpoint
-from workers.learner import ZmqRollouts
-from workers.supervisor import Restarts, Supervisor
+from oodil.bench import learner_rate
+from oodil.pipeline.algorithms.networks import PolicyNetwork
+from oodil.pipeline.config import EnvironmentConfig, PpoConfig, RunConfig
+from oodil.pipeline.data import Snapshot
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.environments.batch import STATE
+from oodil.pipeline.loading import parse_config
+from oodil.pipeline.training import experience
+from oodil.pipeline.versions import library_versions
+from oodil.workers import rollout_worker as rollout_process
+from oodil.workers.channels import private_endpoint
+from oodil.workers.supervisor import Restarts, Supervisor
+from oodil.workers.zmq_rollouts import ZmqRollouts
 
 PARTS = ("stepping", "learner", "scaling")
 ENVIRONMENTS = ("oodil/Hopper-v0", "oodil/Walker2d-v0", "oodil/HalfCheetah-v0")
@@ -244,15 +245,15 @@ def scaling(env_id: str, rounds: int) -> dict[str, Any]:
 def imitation(python: str, total_steps: int, rounds: int, workers: int) -> dict[str, Any]:
     """Compare with the `imitation` library: GAIL, PPO, the same networks, batch, epochs and minibatches.
 
-    Beside it the loop as it is by default, whose networks and batch are the same, too, and whose generator is TRPO.
+    Beside it the loop as it is by default, whose networks and batch are the same, too, with TRPO.
     """
-    generator = PpoConfig(epochs=IMITATION_EPOCHS, minibatch_size=IMITATION_MINIBATCH, learning_rate=3e-4)
+    policy_optimizer = PpoConfig(epochs=IMITATION_EPOCHS, minibatch_size=IMITATION_MINIBATCH, learning_rate=3e-4)
     default = run_config("oodil/Hopper-v0", total_steps)
     assert default.imitation.gail.steps_per_iteration == IMITATION_BATCH
     config = run_config(
         "oodil/Hopper-v0",
         total_steps,
-        generator=generator.model_dump(),
+        policy_optimizer=policy_optimizer.model_dump(),
         value={"epochs": IMITATION_EPOCHS, "minibatch_size": IMITATION_MINIBATCH},
     )
     peer_steps = total_steps // 4

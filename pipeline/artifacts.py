@@ -18,15 +18,13 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
+from oodil.pipeline.errors import DamagedArtifactError
+
 MANIFEST = "manifest.json"
 KEPT_CHECKPOINTS = 2
 
 Files = dict[str, bytes]
 """Contents of an artifact by file name."""
-
-
-class DamagedArtifactError(RuntimeError):
-    """A file of a finished artifact is missing or does not have the bytes that its manifest names."""
 
 
 def encode_arrays(arrays: dict[str, NDArray]) -> bytes:

@@ -1,4 +1,4 @@
-"""The configuration: one frozen model, validated once (`pipeline.loading`), written into the run directory.
+"""The configuration: one frozen model, validated once (`oodil.pipeline.loading`), written into the run directory.
 
 Every field has a type, a default where one is sensible, and a line below it. Nothing here imports torch or a simulator.
 """
@@ -26,7 +26,7 @@ class EnvironmentConfig(_Section):
 
 
 class TrpoConfig(_Section):
-    """Trust region policy optimisation; the official constants but for ``fisher_every``."""
+    """Trust region policy optimization; the official constants but for ``fisher_every``."""
 
     kind: Literal["trpo"] = "trpo"
     max_kl: PositiveFloat = 0.01
@@ -46,7 +46,7 @@ class TrpoConfig(_Section):
 
 
 class PpoConfig(_Section):
-    """Proximal policy optimisation with the clipped surrogate."""
+    """Proximal policy optimization with the clipped surrogate."""
 
     kind: Literal["ppo"] = "ppo"
     learning_rate: PositiveFloat = 3e-4
@@ -108,11 +108,11 @@ class TrainingConfig(_Section):
     discount: UnitInterval = 0.995
     """Discount per step."""
     gae_lambda: UnitInterval = 0.97
-    """Decay of generalised advantage estimation."""
+    """Decay of generalized advantage estimation."""
     policy_hidden: Hidden = (64, 64)
     """Widths of the policy's hidden layers."""
-    normalise_observations: bool = True
-    """Standardise what policy and value see, by the weighted demonstrations' statistics (for experts, by running
+    normalize_observations: bool = True
+    """Standardize what policy and value see, by the weighted demonstrations' statistics (for experts, by running
     ones). The discriminator always sees raw states."""
     scale_rewards: bool = False
     """Multiply rewards by 1 - discount, so that values are of order one."""
@@ -120,7 +120,7 @@ class TrainingConfig(_Section):
     """Let the steps of the policy and of the discriminator shrink linearly to zero, so that the end is settled."""
     initial_log_std: float = 0.0
     """Logarithm of the policy's initial standard deviation."""
-    generator: Annotated[TrpoConfig | PpoConfig, Field(discriminator="kind")] = TrpoConfig()
+    policy_optimizer: Annotated[TrpoConfig | PpoConfig, Field(discriminator="kind")] = TrpoConfig()
     """How the policy is improved."""
     value: ValueConfig = ValueConfig()
     """The value function."""
@@ -133,10 +133,10 @@ class TrainingConfig(_Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _default_generator(cls, values: Any) -> Any:
+    def _default_policy_optimizer(cls, values: Any) -> Any:
         # Without a kind the fields are those of the default, so that one of them can be overridden alone.
-        if isinstance(values, dict) and isinstance(values.get("generator"), dict):
-            return values | {"generator": {"kind": "trpo"} | values["generator"]}
+        if isinstance(values, dict) and isinstance(values.get("policy_optimizer"), dict):
+            return values | {"policy_optimizer": {"kind": "trpo"} | values["policy_optimizer"]}
         return values
 
     @property
@@ -204,7 +204,7 @@ class ClusteringConfig(_Section):
     released code's; the defaults differ where docs/decisions.md says why."""
 
     num_clusters: PositiveInt = 5
-    """K at initialisation; clusters may end up empty. With 1 there is nothing to train."""
+    """K at initialization; clusters may end up empty. With 1 there is nothing to train."""
     subtrajectory_length: int = Field(default=20, ge=2)
     """States per sub-trajectory."""
     sampling: Literal["fixed_length", "fixed_stride"] = "fixed_length"
@@ -213,8 +213,8 @@ class ClusteringConfig(_Section):
     """Width of the LSTM, and of the embedding."""
     temperature: PositiveFloat = 1.0
     """Divides the cosine similarities."""
-    centre_weight: float = Field(default=0.01, ge=0.0)
-    """Lambda: weight of the distance to the centres."""
+    center_weight: float = Field(default=0.01, ge=0.0)
+    """Lambda: weight of the distance to the centers."""
     reduction: Literal["sum", "mean"] = "sum"
     """How that distance is reduced over the 2B sub-trajectories of a batch."""
     learning_rate: PositiveFloat = 1e-3
@@ -230,16 +230,16 @@ class ClusteringConfig(_Section):
     """Iterations with both losses."""
     batch_size: PositiveInt = 128
     """Demonstrations per iteration; all of them if there are fewer."""
-    initial_centres: Literal["trajectories", "kmeans"] = "kmeans"
+    initial_centers: Literal["trajectories", "kmeans"] = "kmeans"
     """K random demonstrations (appendix) or k-means of all (official code)."""
     initial_count: PositiveInt = 100
-    """Counter at which each centre's running mean starts."""
-    update_order: Literal["step_first", "centres_first"] = "step_first"
-    """Gradient step, re-assign, then centres (appendix), or centres before the step (official code)."""
-    normalise_centres: bool = True
-    """Keep centres on the unit sphere."""
-    standardise_states: bool = True
-    """Standardise each state dimension over the set."""
+    """Counter at which each center's running mean starts."""
+    update_order: Literal["step_first", "centers_first"] = "step_first"
+    """Gradient step, re-assign, then centers (appendix), or centers before the step (official code)."""
+    normalize_centers: bool = True
+    """Keep centers on the unit sphere."""
+    standardize_states: bool = True
+    """Standardize each state dimension over the set."""
     label_draws: PositiveInt = 5
     """Sub-trajectories of each demonstration whose features are averaged, for k-means and for the final label."""
 
@@ -259,16 +259,16 @@ CLUSTERING_PRESETS: dict[str, dict[str, Any]] = {
         "learning_rate": 0.01,
         "sufficient_stability": None,
         "joint_iterations": 2000,
-        "initial_centres": "trajectories",
+        "initial_centers": "trajectories",
     },
     "official": {
         "sampling": "fixed_stride",
         "weight_decay": 1e-6,
         "sufficient_stability": None,
         "joint_iterations": 1800,
-        "update_order": "centres_first",
-        "normalise_centres": False,
-        "standardise_states": False,
+        "update_order": "centers_first",
+        "normalize_centers": False,
+        "standardize_states": False,
         "label_draws": 1,
     },
 }

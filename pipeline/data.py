@@ -1,6 +1,8 @@
-"""What flows between the stages. Letters: N demonstrations, T states of one, S observation, K clusters.
+"""What flows between stages, and between a learner and whoever collects for it: NumPy alone.
 
 Shapes are checked where a value is made, so that no stage has to ask again.
+
+Letters: N demonstrations, T states of one or steps of a rollout, G simulators, S observation, A action.
 """
 
 from collections.abc import Iterable
@@ -9,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-
-class DataError(ValueError):
-    """Demonstrations that cannot be used; the message names the demonstration, the value and the limit."""
+from oodil.pipeline.errors import DataError
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.seeding import Key
 
 
 def offsets_of(lengths: Iterable[int]) -> NDArray[np.int64]:
@@ -154,3 +156,67 @@ class Demonstrations:
             returns=self.returns[chosen],
             terminated=self.terminated[chosen],
         )
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Everything that the future of G simulators depends on."""
+
+    states: NDArray[np.float64]
+    """(G, N); what it means is the batch's own affair. MuJoCo's integration states, or a seed and actions."""
+    elapsed_steps: NDArray[np.int64]
+    """(G,) steps since the last reset."""
+    episode_returns: NDArray[np.float64]
+    """(G,) sum of the environment's own reward since the last reset; for evaluation only."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Everything that one rollout depends on."""
+
+    iteration: int
+    group: int
+    env_id: str
+    dynamics: tuple[tuple[str, float], ...]
+    num_simulators: int
+    num_steps: int
+    policy_version: int
+    policy: GaussianPolicy
+    key: Key
+    snapshot: Snapshot | None
+    """Where the group stands; None starts every simulator with a fresh episode."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Experience of one env group under exactly one policy version."""
+
+    policy_version: int
+    observations: NDArray[np.float32]
+    """(T, G, S)"""
+    next_observations: NDArray[np.float32]
+    """(T, G, S), before any reset."""
+    actions: NDArray[np.float32]
+    """(T, G, A)"""
+    log_probs: NDArray[np.float32]
+    """(T, G) under the policy that acted."""
+    terminated: NDArray[np.bool_]
+    """(T, G)"""
+    truncated: NDArray[np.bool_]
+    """(T, G)"""
+    env_rewards: NDArray[np.float64]
+    """(T, G); only experts learn from it."""
+    episode_returns: NDArray[np.float64]
+    """(E,) true returns of the episodes that ended; evaluation only."""
+    episode_lengths: NDArray[np.int64]
+    """(E,)"""
+
+
+@dataclass(frozen=True)
+class UnitResult:
+    """A unit's rollout and where its env group stands afterwards."""
+
+    iteration: int
+    group: int
+    rollout: Rollout
+    snapshot: Snapshot

@@ -13,10 +13,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Episode
-from pipeline.environments import Simulators, make_batch
-from pipeline.policy import Controller, GaussianPolicy
-from pipeline.seeding import Key, generator
+from oodil.pipeline.data import Episode
+from oodil.pipeline.environments import Simulators, make_batch
+from oodil.pipeline.errors import UnusableEnvironmentError
+from oodil.pipeline.policy import Controller, GaussianPolicy
+from oodil.pipeline.seeding import Key, numpy_rng
 
 FRAMES_PER_SECOND = 30
 """Of a video, about; the environments run at 10 to 240 steps per second of simulated time."""
@@ -66,14 +67,14 @@ def evaluate(
     stochastic: bool = False,
 ) -> Evaluation:
     """Run ``episodes`` fresh episodes, with mean actions unless ``stochastic``."""
-    seen = run_episodes(make_batch(env_id, dynamics, episodes), policy, generator(key), stochastic=stochastic)
+    seen = run_episodes(make_batch(env_id, dynamics, episodes), policy, numpy_rng(key), stochastic=stochastic)
     return Evaluation(np.array([e.env_return for e in seen]), np.array([len(e.states) - 1 for e in seen]))
 
 
 def film(policy: GaussianPolicy, env_id: str, dynamics: Mapping[str, float], seed: int, path: Path) -> float:
     """Film one deterministic episode as MP4 and return its true return.
 
-    Raises OSError when nothing can be rendered here, with what is missing.
+    Raises UnusableEnvironmentError when nothing can be rendered here, with what is missing.
     """
     import imageio.v3 as imageio
 
@@ -96,7 +97,7 @@ def film(policy: GaussianPolicy, env_id: str, dynamics: Mapping[str, float], see
         env.close()
         imageio.imwrite(path, np.stack(frames), fps=fps)
     except (ImportError, RuntimeError, AttributeError, mujoco.FatalError, gymnasium.error.Error) as error:
-        raise OSError(
+        raise UnusableEnvironmentError(
             f"cannot render here ({error}); a machine without a display needs EGL or OSMesa "
             "(Debian: apt-get install libegl1 or libosmesa6, then MUJOCO_GL=egl or MUJOCO_GL=osmesa)"
         ) from error

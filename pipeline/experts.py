@@ -8,14 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.artifacts import Artifact, Checkpoints, Files, encode_arrays, encode_json, read_artifact
-from pipeline.config import EnvironmentConfig, PpoConfig, TrainingConfig, ValueConfig
-from pipeline.data import DataError, Demonstrations, Episode
-from pipeline.environments import Simulators, make_batch
-from pipeline.evaluation import run_episodes
-from pipeline.policy import Controller, GaussianPolicy
-from pipeline.seeding import derive_key, generator
-from pipeline.stage import JobContext
+from oodil.pipeline.artifacts import Artifact, Checkpoints, Files, encode_arrays, encode_json, read_artifact
+from oodil.pipeline.config import EnvironmentConfig, PpoConfig, TrainingConfig, ValueConfig
+from oodil.pipeline.data import Demonstrations, Episode
+from oodil.pipeline.environments import Simulators, make_batch
+from oodil.pipeline.errors import DamagedArtifactError, DataError, ExpertError
+from oodil.pipeline.evaluation import run_episodes
+from oodil.pipeline.policy import Controller, GaussianPolicy
+from oodil.pipeline.seeding import derive_key, numpy_rng
+from oodil.pipeline.stage import JobContext
 
 EXPERT_TRAINING = TrainingConfig(
     total_steps=2_500_000,
@@ -25,9 +26,9 @@ EXPERT_TRAINING = TrainingConfig(
     lag=0,
     discount=0.995,
     gae_lambda=0.97,
-    normalise_observations=True,
+    normalize_observations=True,
     scale_rewards=True,
-    generator=PpoConfig(learning_rate=1e-3, epochs=5, minibatch_size=512),
+    policy_optimizer=PpoConfig(learning_rate=1e-3, epochs=5, minibatch_size=512),
     value=ValueConfig(learning_rate=1e-3, epochs=5, minibatch_size=512),
     num_evaluations=0,
 )
@@ -37,21 +38,17 @@ COLLECTION_SIMULATORS = 16
 """Episodes collected side by side; part of what the demonstrations depend on."""
 
 
-class ExpertError(ValueError):
-    """An expert that is missing, damaged, or does not fit; the message names its folder."""
-
-
 def train_expert(
     environment: EnvironmentConfig, config: TrainingConfig, seed: int, context: JobContext, checkpoints: Checkpoints
 ) -> GaussianPolicy:
     """Train one expert on the environment's reward."""
-    from pipeline.algorithms.learner import EnvReward, Learner
-    from pipeline.training import train
+    from oodil.pipeline.algorithms.learner import EnvReward, Learner
+    from oodil.pipeline.training import train
 
     simulators = make_batch(environment.id, environment.dynamics, 1)
     learner = Learner(simulators.observation_dim, simulators.action_dim, config, EnvReward(), seed)
     train(learner, environment, config, [], context, checkpoints)
-    return learner.behaviour_policy()
+    return learner.behavior_policy()
 
 
 def expert_files(policy: GaussianPolicy, description: dict[str, Any]) -> Files:
@@ -66,7 +63,7 @@ def load_expert(path: Path) -> tuple[GaussianPolicy, Artifact]:
         if artifact is None:
             raise ExpertError(f"{path}: no expert is saved here")
         return GaussianPolicy.from_arrays(artifact.arrays("policy.safetensors")), artifact
-    except (RuntimeError, ValueError) as error:
+    except (DamagedArtifactError, ValueError) as error:
         raise ExpertError(str(error)) from error
 
 
@@ -104,7 +101,7 @@ def collect_demonstrations(
         rounds += 1
         key = derive_key(seed, "demonstrations", label, rounds)
         stochastic = policy is not None and not deterministic
-        episodes = run_episodes(simulators, controller, generator(key), stochastic=stochastic)
+        episodes = run_episodes(simulators, controller, numpy_rng(key), stochastic=stochastic)
         if full_length_only:
             episodes = [each for each in episodes if len(each.states) == simulators.max_episode_steps + 1]
         if minimum_return is not None:

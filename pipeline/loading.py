@@ -7,11 +7,8 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from pipeline.config import RunConfig
-
-
-class ConfigError(ValueError):
-    """A configuration that cannot be used; the message names the key, the value and what is allowed."""
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.errors import ConfigError
 
 
 def load_config(path: Path, overrides: list[str] | None = None) -> RunConfig:

@@ -1,7 +1,7 @@
 """The policy that travels: a Gaussian whose mean is a small tanh network, evaluated with NumPy alone.
 
 Rollout workers need nothing but this file and a simulator, so they start fast and stay small. The network that is
-trained lives in `pipeline.algorithms.networks`; a test holds the two together.
+trained lives in `oodil.pipeline.algorithms.networks`; a test holds the two together.
 """
 
 from dataclasses import dataclass

@@ -6,8 +6,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from pipeline.artifacts import Artifact, DamagedArtifactError
-from pipeline.stage import Run
+from oodil.pipeline.artifacts import Artifact
+from oodil.pipeline.errors import DamagedArtifactError, NotFinishedError
+from oodil.pipeline.stage import Run
 
 STAGES = ("demonstrations", "clustering", "transferability", "imitation", "naive_gail", "oracle")
 """In the order in which they depend on each other."""
@@ -29,7 +30,7 @@ class Results:
         for stage in STAGES:
             try:
                 artifact = run.artifact(stage)
-            except LookupError:
+            except NotFinishedError:
                 if stage in expected:
                     self.problems[stage] = "not finished"
                 continue

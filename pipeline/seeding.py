@@ -16,7 +16,7 @@ def derive_key(root_seed: int, *path: str | int) -> Key:
     return (root_seed, *(zlib.crc32(part.encode()) if isinstance(part, str) else part for part in path))
 
 
-def generator(key: Key) -> np.random.Generator:
+def numpy_rng(key: Key) -> np.random.Generator:
     """Return a fresh generator for a key; the same key always starts the same stream."""
     return np.random.Generator(np.random.PCG64(_sequence(key)))
 

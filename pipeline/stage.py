@@ -1,34 +1,21 @@
 """The contract of a stage, and what a running job sees of the runtime.
 
 A stage is a name, a version, its inputs and one or more independent jobs. It never starts a process or opens a socket:
-an engine (`workers.engine`) decides where its jobs run and who collects their rollouts.
+an engine (`oodil.workers.engine`) decides where its jobs run and who collects their rollouts.
 """
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from pipeline.artifacts import Artifact, Checkpoints, Files, RunDirectory, fingerprint, read_artifact
-from pipeline.config import RunConfig
-from pipeline.rollout import Follow, Unit, UnitResult, nothing_follows
+from oodil.pipeline.artifacts import Artifact, Checkpoints, Files, RunDirectory, fingerprint, read_artifact
+from oodil.pipeline.collecting import RolloutSource
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.errors import NotFinishedError
 
 
 class JobStoppedError(Exception):
     """A job stopped because it was asked to, after writing a checkpoint."""
-
-
-class RolloutSource(Protocol):
-    """Who collects: the job's own process, rollout workers behind a socket, or a cluster. All give the same bits."""
-
-    def submit(self, units: list[Unit]) -> None:
-        """Hand over units; collection may begin at once."""
-
-    def gather(self, follow: Follow = nothing_follows) -> list[UnitResult]:
-        """Wait for the iteration that was submitted first and return its results in group order.
-
-        What ``follow`` makes of a result is submitted as soon as the result is there, so that nobody who collects
-        waits for the slowest group. It is called once for each result, in any order, on the caller's thread.
-        """
 
 
 class JobContext(Protocol):
@@ -55,17 +42,17 @@ class Run:
     directory: RunDirectory
 
     def artifact(self, stage: str) -> Artifact:
-        """Return the finished artifact of an earlier stage. Raises LookupError if it is not finished."""
+        """Return the finished artifact of an earlier stage. Raises NotFinishedError if it is not finished."""
         return _finished(read_artifact(self.directory.stage(stage)), stage)
 
     def job_artifact(self, stage: str, job: str) -> Artifact:
-        """Return the finished artifact of a job of the same stage. Raises LookupError if it is not finished."""
+        """Return the finished artifact of a job of the same stage. Raises NotFinishedError if it is not finished."""
         return _finished(read_artifact(self.directory.job(stage, job)), f"{stage}/{job}")
 
 
 def _finished(artifact: Artifact | None, name: str) -> Artifact:
     if artifact is None:
-        raise LookupError(f"{name} is not finished")
+        raise NotFinishedError(f"{name} is not finished")
     return artifact
 
 

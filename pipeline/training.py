@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.algorithms.learner import Learner
-from pipeline.artifacts import Checkpoints
-from pipeline.config import EnvironmentConfig, TrainingConfig
-from pipeline.environments import Snapshot
-from pipeline.policy import GaussianPolicy
-from pipeline.rollout import Rollout, Unit, UnitResult, nothing_follows
-from pipeline.seeding import derive_key, torch_seed
-from pipeline.stage import JobContext, JobStoppedError
+from oodil.pipeline.algorithms.learner import Learner
+from oodil.pipeline.artifacts import Checkpoints
+from oodil.pipeline.collecting import nothing_follows
+from oodil.pipeline.config import EnvironmentConfig, TrainingConfig
+from oodil.pipeline.data import Rollout, Snapshot, Unit, UnitResult
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.seeding import derive_key, torch_seed
+from oodil.pipeline.stage import JobContext, JobStoppedError
 
 Arrays = dict[str, NDArray]
 
@@ -135,13 +135,13 @@ def train(
         is_last = iteration + 1 == config.num_iterations
         position.iteration = iteration + 1
         if config.lag == 1:
-            position.policy, position.policy_version = learner.behaviour_policy(), iteration
+            position.policy, position.policy_version = learner.behavior_policy(), iteration
         results = context.rollouts.gather(follow if config.lag == 1 and not is_last else nothing_follows)
         rollouts = [result.rollout for result in results]
         position.snapshots = [result.snapshot for result in results]
         metrics = learner.update(rollouts, iteration)
         if config.lag == 0:
-            position.policy, position.policy_version = learner.behaviour_policy(), position.iteration
+            position.policy, position.policy_version = learner.behavior_policy(), position.iteration
             if not is_last:
                 context.rollouts.submit([unit(group) for group in range(config.num_groups)])
         _refuse_divergence(learner, metrics, iteration)
@@ -229,7 +229,7 @@ def _resume(learner: Learner, config: TrainingConfig, context: JobContext, check
         context.warn(warning)
     if arrays is None:
         fresh: list[Snapshot | None] = [None] * config.num_groups
-        return _Position(0, 0, learner.behaviour_policy(), fresh, History())
+        return _Position(0, 0, learner.behavior_policy(), fresh, History())
 
     def below(prefix: str) -> Arrays:
         return {name[len(prefix) :]: value for name, value in arrays.items() if name.startswith(prefix)}

@@ -14,10 +14,9 @@ import pytest  # noqa: E402
 import torch  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
-from pipeline.algorithms.networks import PolicyNetwork  # noqa: E402
-from pipeline.data import Demonstrations  # noqa: E402
-from pipeline.policy import GaussianPolicy  # noqa: E402
-from pipeline.rollout import Rollout  # noqa: E402
+from oodil.pipeline.algorithms.networks import PolicyNetwork  # noqa: E402
+from oodil.pipeline.data import Demonstrations, Rollout  # noqa: E402
+from oodil.pipeline.policy import GaussianPolicy  # noqa: E402
 
 torch.set_num_threads(1)
 # A busy machine is no defect, and the gate must give the same answer twice.

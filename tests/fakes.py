@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import Files, RunDirectory, encode_arrays
-from pipeline.config import RunConfig
-from pipeline.loading import parse_config
-from pipeline.policy import GaussianPolicy
-from pipeline.rollout import Unit, UnitResult, nothing_follows
-from pipeline.seeding import derive_key
-from pipeline.stage import JobContext, JobStoppedError, RolloutSource, Run, Stage
+from oodil.pipeline.artifacts import Files, RunDirectory, encode_arrays
+from oodil.pipeline.collecting import RolloutSource, nothing_follows
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.data import Unit, UnitResult
+from oodil.pipeline.loading import parse_config
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.seeding import derive_key
+from oodil.pipeline.stage import JobContext, JobStoppedError, Run, Stage
 
 STAGES = "tests.fakes:stage_named"
 NUM_GROUPS = 4

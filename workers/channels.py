@@ -3,8 +3,8 @@
 The learner binds a ROUTER and every worker connects a DEALER, so workers come and go as they like and the learner
 answers each by its name. By default both ends are on this machine: the socket lies in a folder that only this user may
 enter. For workers on other machines the same socket also listens on an address, and then every peer, local ones
-included, must prove with CURVE that it holds a key that is allowed (`workers.keys`). Every wait has a deadline, queues
-are bounded, and closing drops what was not sent, so nothing here can hang.
+included, must prove with CURVE that it holds a key that is allowed (`oodil.workers.keys`). Every wait has a
+deadline, queues are bounded, and closing drops what was not sent, so nothing here can hang.
 """
 
 import hashlib
@@ -21,8 +21,9 @@ from pathlib import Path
 import zmq
 from zmq.auth.thread import ThreadAuthenticator
 
-from workers.keys import KeyPair, KeysError, client_keys, server_keys
-from workers.messages import MAX_FRAME_BYTES
+from oodil.pipeline.errors import OodilError
+from oodil.workers.keys import KeyPair, KeysError, client_keys, server_keys
+from oodil.workers.messages import MAX_FRAME_BYTES
 
 _QUEUE_LIMIT = 64
 """Messages waiting per peer and direction; a worker holds two units, so only a defect reaches it."""
@@ -48,11 +49,11 @@ class Access:
     """The folder of the learner's keys and of the allowed ones."""
 
 
-class EndpointError(RuntimeError):
+class EndpointError(OodilError):
     """The folder for the socket cannot be used."""
 
 
-class AddressError(ValueError):
+class AddressError(OodilError):
     """Nothing can listen on an address; the message says why."""
 
 

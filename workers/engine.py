@@ -1,4 +1,4 @@
-"""The one interface to parallelism: run the jobs of a stage, wherever they run and whoever collects for them.
+"""The one interface to parallelizm: run the jobs of a stage, wherever they run and whoever collects for them.
 
 What a job computes never depends on the engine, on the number of workers, or on what died meanwhile.
 """
@@ -13,15 +13,16 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import Protocol
 
-from pipeline.config import RuntimeConfig
-from pipeline.rollout import InlineRollouts
-from pipeline.stage import JobStoppedError, RolloutSource, Run, Stage
-from workers import job as job_process
-from workers import rollout as rollout_process
-from workers.channels import Access, private_endpoint
-from workers.reports import Progress, Silent, Warn
-from workers.supervisor import Died, Ended, Restarts, Said, Started, Supervisor
-from workers.supervisor import Event as ChildEvent
+from oodil.pipeline.collecting import InlineRollouts, RolloutSource
+from oodil.pipeline.config import RuntimeConfig
+from oodil.pipeline.errors import ConfigError
+from oodil.pipeline.stage import JobStoppedError, Run, Stage
+from oodil.workers import job as job_process
+from oodil.workers import rollout_worker as rollout_process
+from oodil.workers.channels import Access, private_endpoint
+from oodil.workers.reports import Progress, Silent, Warn
+from oodil.workers.supervisor import Died, Ended, Restarts, Said, Started, Supervisor
+from oodil.workers.supervisor import Event as ChildEvent
 
 _POLL_S = 0.2
 _WORKER = "rollout-worker-"
@@ -113,12 +114,14 @@ class LocalEngine:
     """Runs jobs on this machine: in ``workers`` processes, or with 0 in this one.
 
     A distributed stage has one learner process, and ``workers`` rollout workers beside it; with ``access`` others may
-    join them from elsewhere (`workers.remote`).
+    join them from elsewhere (`oodil.workers.remote`).
     """
 
-    def __init__(self, workers: int, stages: str = "pipeline.stages:stage_named", access: Access | None = None) -> None:
+    def __init__(
+        self, workers: int, stages: str = "oodil.pipeline.stages:stage_named", access: Access | None = None
+    ) -> None:
         if workers < 0:
-            raise ValueError(f"workers is {workers}; it cannot be negative")
+            raise ConfigError(f"workers is {workers}; it cannot be negative")
         self._workers = workers
         self._access = access
         """Where rollout workers of other machines may join, if they may."""

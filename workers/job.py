@@ -7,14 +7,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from workers.channels import Access
-from workers.reports import Progress, Report, Silent, Warn
-from workers.supervisor import Link
-from workers.wire import shortened
+from oodil.workers.channels import Access
+from oodil.workers.reports import Progress, Report, Silent, Warn
+from oodil.workers.supervisor import Link
+from oodil.workers.wire import shortened
 
 if TYPE_CHECKING:
     # A job's process says that it runs before it loads what it computes with.
-    from pipeline.stage import JobContext, RolloutSource, Run, Stage
+    from oodil.pipeline.stage import JobContext, Run, Stage
+from oodil.pipeline.collecting import RolloutSource
 
 DONE, STOPPED = "done", "stopped"
 _REPORT_INTERVAL_S = 0.2
@@ -64,7 +65,7 @@ def main(
 
     Returns DONE or STOPPED.
     """
-    from pipeline.stage import JobStoppedError
+    from oodil.pipeline.stage import JobStoppedError
 
     found, run = find(run_path, stages, stage)
     runtime = run.config.runtime
@@ -80,9 +81,9 @@ def main(
 
 def find(run_path: str, stages: str, name: str) -> "tuple[Stage, Run]":
     """Return a stage of the run in a folder; ``stages`` is module:function for ``(config, name) -> Stage``."""
-    from pipeline.artifacts import RunDirectory
-    from pipeline.config import RunConfig
-    from pipeline.stage import Run
+    from oodil.pipeline.artifacts import RunDirectory
+    from oodil.pipeline.config import RunConfig
+    from oodil.pipeline.stage import Run
 
     directory = RunDirectory(Path(run_path))
     config = RunConfig.model_validate_json(directory.config.read_text())
@@ -92,8 +93,8 @@ def find(run_path: str, stages: str, name: str) -> "tuple[Stage, Run]":
 
 def execute(stage: "Stage", run: "Run", job: str, context: "JobContext") -> None:
     """Run a job in this process and write its artifact; its checkpoints go when that is safe on disk."""
-    from pipeline.artifacts import write_artifact
-    from pipeline.versions import library_versions
+    from oodil.pipeline.artifacts import write_artifact
+    from oodil.pipeline.versions import library_versions
 
     files = stage.run_job(run, job, context)
     write_artifact(run.directory.job(stage.name, job), stage.job_origin(run, job), files, library_versions())
@@ -104,8 +105,8 @@ def execute(stage: "Stage", run: "Run", job: str, context: "JobContext") -> None
 def _rollouts(
     link: Link, endpoint: str, run_id: str, unit_timeout_s: float, access: Access | None
 ) -> "Iterator[RolloutSource]":
-    from pipeline.rollout import InlineRollouts
-    from workers.learner import ZmqRollouts
+    from oodil.pipeline.collecting import InlineRollouts
+    from oodil.workers.zmq_rollouts import ZmqRollouts
 
     if not endpoint:
         yield InlineRollouts()

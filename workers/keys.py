@@ -11,11 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from oodil.pipeline.errors import OodilError
+
 LEARNER, WORKER = "learner", "worker"
 _LENGTH = 40
 
 
-class KeysError(ValueError):
+class KeysError(OodilError):
     """Keys that are missing, malformed or open to others; the message names the file."""
 
 

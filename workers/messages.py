@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.environments import Snapshot
-from pipeline.policy import GaussianPolicy
-from pipeline.rollout import Rollout, Unit, UnitResult
-from workers.wire import (
+from oodil.pipeline.data import Rollout, Snapshot, Unit, UnitResult
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.workers.wire import (
     MAX_HEADER_BYTES,
     MessageError,
     Readers,

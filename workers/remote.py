@@ -5,14 +5,15 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 
-from workers import rollout as rollout_process
-from workers.supervisor import Died, Ended, Restarts, Started, Supervisor
+from oodil.pipeline.errors import OodilError
+from oodil.workers import rollout_worker as rollout_process
+from oodil.workers.supervisor import Died, Ended, Restarts, Started, Supervisor
 
 _POLL_S = 0.2
 _RESTARTS, _DELAY_S = 1_000_000, 1.0
 
 
-class WorkersError(RuntimeError):
+class WorkersError(OodilError):
     """The learner does not want these workers; the message says why."""
 
 

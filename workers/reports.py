@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from workers.wire import MessageError, Readers, brief, count, items, numbers_by_name, pack, read, text, unpack
+from oodil.workers.wire import MessageError, Readers, brief, count, items, numbers_by_name, pack, read, text, unpack
 
 
 # parent -> child

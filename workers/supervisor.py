@@ -23,8 +23,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from workers.reports import Failed, Finished, Report, Stop, decode_report, encode_report
-from workers.wire import MessageError, shortened
+from oodil.workers.reports import Failed, Finished, Report, Stop, decode_report, encode_report
+from oodil.workers.wire import MessageError, shortened
 
 MAX_DELAY_S = 10.0
 _MAX_REPORT_BYTES = 1024 * 1024

@@ -1,4 +1,4 @@
-"""Generalised advantage estimation. Letters: T steps, G simulators."""
+"""Generalized advantage estimation. Letters: T steps, G simulators."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 
 
-def generalised_advantages(
+def generalized_advantages(
     rewards: Array,
     values: Array,
     next_values: Array,
@@ -30,6 +30,6 @@ def generalised_advantages(
     return advantages
 
 
-def standardised(advantages: Array) -> Array:
+def standardized(advantages: Array) -> Array:
     """Return advantages with mean 0 and standard deviation 1 over the batch."""
     return np.asarray((advantages - advantages.mean()) / (advantages.std() + 1e-8))

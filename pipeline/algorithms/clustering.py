@@ -1,7 +1,7 @@
 """Contrastive clustering, phase 1 of the method (Algorithm 1 of the appendix, docs/algorithms.md).
 
-The encoder is trained first by the contrastive loss alone, then together with K centres that follow their members as
-running means. Unlike the paper, the counters of these means start above zero, as in the official code, centres stay on
+The encoder is trained first by the contrastive loss alone, then together with K centers that follow their members as
+running means. Unlike the paper, the counters of these means start above zero, as in the official code, centers stay on
 the unit sphere, and a demonstration stands for itself, at the start and at the end, by the mean feature of several
 sub-trajectories. The first phase is left out where the sub-trajectories of a demonstration agree on its cluster without
 it: it would only spread demonstrations evenly over the sphere and close the gap around a mode with few of them
@@ -19,41 +19,42 @@ from sklearn.cluster import KMeans
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pipeline.algorithms.contrastive import Encoder, Sampling, Subtrajectories, contrastive_loss, standardisation
-from pipeline.algorithms.optimiser import Adam
-from pipeline.config import ClusteringConfig
-from pipeline.data import DataError, Demonstrations
-from pipeline.seeding import Key, derive_key, generator, torch_seed
+from oodil.pipeline.algorithms.contrastive import Encoder, Sampling, Subtrajectories, contrastive_loss, standardization
+from oodil.pipeline.algorithms.optimizer import Adam
+from oodil.pipeline.config import ClusteringConfig
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.errors import DataError
+from oodil.pipeline.seeding import Key, derive_key, numpy_rng, torch_seed
 
 ENCODED_AT_ONCE = 1024
 """Sub-trajectories per pass outside training; it bounds the memory."""
 
 
-def assign(features: Tensor, centres: Tensor) -> Tensor:
-    """Return (...) int64 ids of the nearest of (K, E) centres for (..., E) features, Eqn (2)."""
-    # ||f - c||^2 = ||f||^2 + ||c||^2 - 2 <f, c>, and the first term is the same for every centre.
-    return (centres.square().sum(-1) - 2 * features @ centres.T).argmin(-1)
+def assign(features: Tensor, centers: Tensor) -> Tensor:
+    """Return (...) int64 ids of the nearest of (K, E) centers for (..., E) features, Eqn (2)."""
+    # ||f - c||^2 = ||f||^2 + ||c||^2 - 2 <f, c>, and the first term is the same for every center.
+    return (centers.square().sum(-1) - 2 * features @ centers.T).argmin(-1)
 
 
-def centre_loss(features: Tensor, own_centres: Tensor, reduction: str) -> Tensor:
+def center_loss(features: Tensor, own_centers: Tensor, reduction: str) -> Tensor:
     """Return ||F(xi) - C y||^2 / 2, the second term of Eqn (3) without lambda, as sum or mean; both are (2B, E)."""
-    distances = 0.5 * (features - own_centres).square().sum(-1)
+    distances = 0.5 * (features - own_centers).square().sum(-1)
     return distances.sum() if reduction == "sum" else distances.mean()
 
 
-def moved_centres(centres: Tensor, counts: Tensor, features: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-    """Return centres (K, E) and counters (K,) after Eqn (4) for all samples in sequence.
+def moved_centers(centers: Tensor, counts: Tensor, features: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    """Return centers (K, E) and counters (K,) after Eqn (4) for all samples in sequence.
 
     The running mean of m samples that begins at (n, c) ends at (n c + sum f) / (n + m), whatever their order.
 
     Args:
-        centres, counts: (K, E) float32 and (K,) int64 as they stand.
+        centers, counts: (K, E) float32 and (K,) int64 as they stand.
         features, labels: (2B, E) and (2B,) int64 in [0, K).
     """
-    new = torch.bincount(labels, minlength=len(centres))
-    sums = torch.zeros_like(centres).index_add_(0, labels, features)
-    # In this form a centre without new members keeps its bits.
-    moved = centres + (sums - new[:, None] * centres) / (counts + new)[:, None]
+    new = torch.bincount(labels, minlength=len(centers))
+    sums = torch.zeros_like(centers).index_add_(0, labels, features)
+    # In this form a center without new members keeps its bits.
+    moved = centers + (sums - new[:, None] * centers) / (counts + new)[:, None]
     return moved, counts + new
 
 
@@ -71,10 +72,10 @@ class Labelling:
 
 @dataclass(frozen=True)
 class ClusterModel:
-    """A frozen encoder and its centres: all that is needed to label demonstrations, old or new."""
+    """A frozen encoder and its centers: all that is needed to label demonstrations, old or new."""
 
     encoder: Encoder
-    centres: Tensor
+    centers: Tensor
     """(K, E)"""
     counts: Tensor
     """(K,) int64 counters of Eqn (4)."""
@@ -86,7 +87,7 @@ class ClusterModel:
 
     @torch.no_grad()
     def label(self, demonstrations: Demonstrations, draws: int, root_seed: int) -> Labelling:
-        """Label each demonstration by the centre nearest to the mean feature of ``draws`` sub-trajectories of it.
+        """Label each demonstration by the center nearest to the mean feature of ``draws`` sub-trajectories of it.
 
         Raises DataError when the states have another dimension than those of the training set.
         """
@@ -98,13 +99,13 @@ class ClusterModel:
         subtrajectories = Subtrajectories(demonstrations, self.sampling, self.state_mean, self.state_scale)
         features = _encode_all(self.encoder, subtrajectories, draws, derive_key(root_seed, "clustering", "label"))
         mean = normalize(features.mean(0), dim=-1)
-        labels = assign(mean, self.centres).numpy().astype(np.int32)
-        return Labelling(labels, mean.numpy(), _stability(features, mean, self.centres))
+        labels = assign(mean, self.centers).numpy().astype(np.int32)
+        return Labelling(labels, mean.numpy(), _stability(features, mean, self.centers))
 
     def arrays(self) -> dict[str, NDArray]:
         """Return everything by name, for a file; `from_arrays` is the inverse."""
         return {name: value.numpy() for name, value in self.encoder.state_dict().items()} | {
-            "centres": self.centres.numpy(),
+            "centers": self.centers.numpy(),
             "counts": self.counts.numpy(),
             "length": np.array([self.sampling.length], np.int32),
             "stride": np.array([self.sampling.stride], np.int32),
@@ -116,16 +117,16 @@ class ClusterModel:
     def from_arrays(cls, arrays: dict[str, NDArray]) -> "ClusterModel":
         """Rebuild a model from `arrays`. Raises ValueError when a name is missing or shapes do not fit."""
         try:
-            centres, counts = torch.from_numpy(arrays["centres"]), torch.from_numpy(arrays["counts"])
+            centers, counts = torch.from_numpy(arrays["centers"]), torch.from_numpy(arrays["counts"])
             sampling = Sampling(length=int(arrays["length"][0]), stride=int(arrays["stride"][0]))
             mean, scale = arrays["state_mean"], arrays["state_scale"]
-            encoder = Encoder(len(mean), centres.shape[1], torch.Generator())
+            encoder = Encoder(len(mean), centers.shape[1], torch.Generator())
             encoder.load_state_dict({name: torch.from_numpy(arrays[name]) for name in encoder.state_dict()})
         except KeyError as error:
             raise ValueError(f"cluster model has no array {error.args[0]!r}") from None
         except (RuntimeError, IndexError) as error:
             raise ValueError(f"arrays of the cluster model do not fit together: {error}") from error
-        return cls(encoder, centres, counts, sampling, mean, scale)
+        return cls(encoder, centers, counts, sampling, mean, scale)
 
 
 class ContrastiveClustering:
@@ -143,52 +144,52 @@ class ContrastiveClustering:
         self.iteration = 0
         dim = demonstrations.observation_dim
         self._state_mean, self._state_scale = np.zeros(dim, np.float32), np.ones(dim, np.float32)
-        if config.standardise_states:
-            self._state_mean, self._state_scale = standardisation(demonstrations.observations)
+        if config.standardize_states:
+            self._state_mean, self._state_scale = standardization(demonstrations.observations)
         self._subtrajectories = Subtrajectories(
             demonstrations, Sampling.plan(demonstrations.lengths, config), self._state_mean, self._state_scale
         )
         rng = torch.Generator().manual_seed(torch_seed(self._key("encoder")))
         self.encoder = Encoder(dim, config.hidden, rng)
-        self._optimiser = Adam(list(self.encoder.parameters()), config.learning_rate, config.weight_decay)
-        self.centres = torch.zeros(config.num_clusters, config.hidden)
+        self._optimizer = Adam(list(self.encoder.parameters()), config.learning_rate, config.weight_decay)
+        self.centers = torch.zeros(config.num_clusters, config.hidden)
         self.counts = torch.full((config.num_clusters,), config.initial_count)
         self._begin()
 
     def update(self) -> dict[str, float]:
         """Do one iteration and return metrics: loss, contrastive_loss."""
         config = self.config
-        rng = generator(self._key("batch", self.iteration))
+        rng = numpy_rng(self._key("batch", self.iteration))
         chosen = rng.permutation(len(self._subtrajectories))[: config.batch_size]
         views = self._subtrajectories.draw(np.concatenate((chosen, chosen)), rng)
         features = self.encoder(views)
         contrastive = loss = contrastive_loss(features, config.temperature)
         joint = self.iteration >= self._warmup
         if joint:
-            labels = assign(features.detach(), self.centres)
-            if config.update_order == "centres_first":
-                self._move_centres(features.detach(), labels)
-            loss = loss + config.centre_weight * centre_loss(features, self.centres[labels], config.reduction)
-        self._optimiser.step(loss)
+            labels = assign(features.detach(), self.centers)
+            if config.update_order == "centers_first":
+                self._move_centers(features.detach(), labels)
+            loss = loss + config.center_weight * center_loss(features, self.centers[labels], config.reduction)
+        self._optimizer.step(loss)
         if joint and config.update_order == "step_first":
             with torch.no_grad():
                 features = self.encoder(views)
-            self._move_centres(features, assign(features, self.centres))
+            self._move_centers(features, assign(features, self.centers))
         self.iteration += 1
         if self.iteration == self._warmup:
-            self.centres, _ = self._initial_centres()
+            self.centers, _ = self._initial_centers()
         return {"loss": float(loss.detach()), "contrastive_loss": float(contrastive.detach())}
 
     def model(self) -> ClusterModel:
-        """Return the encoder and the centres as they stand."""
+        """Return the encoder and the centers as they stand."""
         sampling = self._subtrajectories.sampling
-        return ClusterModel(self.encoder, self.centres, self.counts, sampling, self._state_mean, self._state_scale)
+        return ClusterModel(self.encoder, self.centers, self.counts, sampling, self._state_mean, self._state_scale)
 
     def state(self) -> dict[str, NDArray]:
         """Return everything that later iterations depend on."""
         tensors = {f"encoder/{name}": value for name, value in self.encoder.state_dict().items()}
-        tensors |= {f"optimiser/{name}": value for name, value in self._optimiser.state().items()}
-        tensors |= {"centres": self.centres, "counts": self.counts, "iteration": torch.tensor([self.iteration])}
+        tensors |= {f"optimizer/{name}": value for name, value in self._optimizer.state().items()}
+        tensors |= {"centers": self.centers, "counts": self.counts, "iteration": torch.tensor([self.iteration])}
         return {name: value.numpy() for name, value in tensors.items()}
 
     def load_state(self, state: dict[str, NDArray]) -> None:
@@ -199,45 +200,45 @@ class ContrastiveClustering:
             return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
         self.encoder.load_state_dict(below("encoder/"))
-        self._optimiser.load_state(below("optimiser/"))
-        self.centres, self.counts = tensors["centres"], tensors["counts"]
+        self._optimizer.load_state(below("optimizer/"))
+        self.centers, self.counts = tensors["centers"], tensors["counts"]
         self.iteration = int(tensors["iteration"])
 
     def _begin(self) -> None:
-        """Place the centres and go straight to the joint phase where there is no warm-up, or no need for it."""
+        """Place the centers and go straight to the joint phase where there is no warm-up, or no need for it."""
         sufficient = self.config.sufficient_stability
         if self._warmup == 0 or sufficient is not None:
-            centres, stability = self._initial_centres()
+            centers, stability = self._initial_centers()
             if sufficient is None or self._warmup == 0 or stability >= sufficient:
-                self.centres, self.iteration = centres, self._warmup
+                self.centers, self.iteration = centers, self._warmup
 
     @torch.no_grad()
-    def _initial_centres(self) -> tuple[Tensor, float]:
+    def _initial_centers(self) -> tuple[Tensor, float]:
         """Return (K, E) features of K random demonstrations, or the k-means of all, and the stability of labels."""
         config = self.config
-        rng = generator(self._key("centres"))
+        rng = numpy_rng(self._key("centres"))
         features = _encode_all(self.encoder, self._subtrajectories, config.label_draws, self._key("centres", "views"))
         mean = normalize(features.mean(0), dim=-1)
-        if config.initial_centres == "trajectories":
-            centres = features[0, rng.permutation(len(mean))[: config.num_clusters]]
+        if config.initial_centers == "trajectories":
+            centers = features[0, rng.permutation(len(mean))[: config.num_clusters]]
         else:
             kmeans = KMeans(config.num_clusters, n_init=10, random_state=int(rng.integers(2**31)))
-            centres = torch.from_numpy(kmeans.fit(mean.numpy()).cluster_centers_)
-        if config.normalise_centres:
-            centres = normalize(centres, dim=-1)
-        return centres, _stability(features, mean, centres)
+            centers = torch.from_numpy(kmeans.fit(mean.numpy()).cluster_centers_)
+        if config.normalize_centers:
+            centers = normalize(centers, dim=-1)
+        return centers, _stability(features, mean, centers)
 
-    def _move_centres(self, features: Tensor, labels: Tensor) -> None:
-        centres, self.counts = moved_centres(self.centres, self.counts, features, labels)
-        self.centres = normalize(centres, dim=-1) if self.config.normalise_centres else centres
+    def _move_centers(self, features: Tensor, labels: Tensor) -> None:
+        centers, self.counts = moved_centers(self.centers, self.counts, features, labels)
+        self.centers = normalize(centers, dim=-1) if self.config.normalize_centers else centers
 
     def _key(self, *path: str | int) -> Key:
         return derive_key(self.root_seed, "clustering", *path)
 
 
-def _stability(features: Tensor, mean: Tensor, centres: Tensor) -> float:
+def _stability(features: Tensor, mean: Tensor, centers: Tensor) -> float:
     """Return the share of (draws, N, E) single features whose label is that of their (N, E) mean."""
-    return float((assign(features, centres) == assign(mean, centres)).double().mean())
+    return float((assign(features, centers) == assign(mean, centers)).double().mean())
 
 
 def _encode_all(encoder: Encoder, subtrajectories: Subtrajectories, draws: int, key: Key) -> Tensor:
@@ -248,5 +249,5 @@ def _encode_all(encoder: Encoder, subtrajectories: Subtrajectories, draws: int, 
 
 def _encode(encoder: Encoder, subtrajectories: Subtrajectories, chosen: NDArray[np.int64], key: Key) -> Tensor:
     """Return (B, E) features of one sub-trajectory, drawn with ``key``, of each of the (B,) chosen demonstrations."""
-    views = subtrajectories.draw(chosen, generator(key))
+    views = subtrajectories.draw(chosen, numpy_rng(key))
     return torch.cat([encoder(part) for part in views.split(ENCODED_AT_ONCE, dim=1)])

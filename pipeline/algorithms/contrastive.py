@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy, normalize
 
-from pipeline.config import ClusteringConfig
-from pipeline.data import Demonstrations
+from oodil.pipeline.config import ClusteringConfig
+from oodil.pipeline.data import Demonstrations
 
 LONGEST_SUBTRAJECTORY = 50
 """States; a recurrent encoder forgets what is further back (appendix B)."""
@@ -68,7 +68,7 @@ class Sampling:
 
 
 class Subtrajectories:
-    """Standardised demonstrations, ready to be sampled: one gather per batch, however long each one is."""
+    """Standardized demonstrations, ready to be sampled: one gather per batch, however long each one is."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class Subtrajectories:
         state_mean: NDArray[np.float32],
         state_scale: NDArray[np.float32],
     ) -> None:
-        """Standardise the states: the (S,) mean is subtracted, the (S,) scale multiplied afterwards."""
+        """Standardize the states: the (S,) mean is subtracted, the (S,) scale multiplied afterwards."""
         self.sampling = sampling
         self._starts, self._lengths = demonstrations.offsets[:-1], demonstrations.lengths
         self._states = torch.from_numpy((demonstrations.observations - state_mean) * state_scale)
@@ -90,7 +90,7 @@ class Subtrajectories:
         return self._states[torch.from_numpy(self.sampling.draw(self._starts[chosen], self._lengths[chosen], rng))]
 
 
-def standardisation(observations: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def standardization(observations: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the (S,) mean of (M, S) states and the reciprocal of their deviation, 1 where a dimension is constant."""
     mean = observations.mean(axis=0, dtype=np.float64)
     deviation = observations.std(axis=0, dtype=np.float64)
@@ -108,7 +108,7 @@ class Encoder(nn.Module):
             nn.init.uniform_(parameter, -(hidden**-0.5), hidden**-0.5, generator=rng)
 
     def forward(self, subtrajectories: Tensor) -> Tensor:
-        """Return (B, E) unit features of (l, B, S) standardised states."""
+        """Return (B, E) unit features of (l, B, S) standardized states."""
         _, (hidden, _) = self.lstm(subtrajectories)
         return normalize(hidden[0], dim=-1)
 

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from pipeline.algorithms.networks import MLP
-from pipeline.algorithms.optimiser import Adam
-from pipeline.config import DiscriminatorConfig
-from pipeline.data import Demonstrations, offsets_of
+from oodil.pipeline.algorithms.networks import MLP
+from oodil.pipeline.algorithms.optimizer import Adam
+from oodil.pipeline.config import DiscriminatorConfig
+from oodil.pipeline.data import Demonstrations, offsets_of
 
 
 def discriminator_loss(demonstration_logits: Tensor, policy_logits: Tensor) -> Tensor:
@@ -35,18 +35,18 @@ def imitation_reward(logits_expert_is_high: Tensor, kind: Literal["positive", "l
 
 
 class Discriminator(nn.Module):
-    """A network on pairs (s, s') and its optimiser."""
+    """A network on pairs (s, s') and its optimizer."""
 
     def __init__(self, observation_dim: int, config: DiscriminatorConfig, rng: torch.Generator) -> None:
         super().__init__()
         self.config = config
         self._seen = np.setdiff1d(np.arange(observation_dim), config.ignored)
         self.net = MLP(2 * len(self._seen), config.hidden, 1, rng)
-        self.restart_optimiser()
+        self.restart_optimizer()
 
-    def restart_optimiser(self) -> None:
+    def restart_optimizer(self) -> None:
         """Begin with fresh moments, at the configured learning rate."""
-        self.optimiser = Adam(list(self.parameters()), self.config.learning_rate)
+        self.optimizer = Adam(list(self.parameters()), self.config.learning_rate)
 
     def forward(self, pairs: Tensor) -> Tensor:
         """Return (B,) logits of `pairs`; high for demonstrations."""
@@ -65,7 +65,7 @@ class Discriminator(nn.Module):
         logits = self.net.head(layer_inputs).squeeze(-1).requires_grad_()
         loss = discriminator_loss(logits[:count], logits[count:])
         (gradient,) = torch.autograd.grad(loss, logits)
-        self.optimiser.apply(self.net.gradients(layer_inputs, gradient.unsqueeze(-1)))
+        self.optimizer.apply(self.net.gradients(layer_inputs, gradient.unsqueeze(-1)))
         with torch.no_grad():
             return {
                 "discriminator_loss": float(loss),

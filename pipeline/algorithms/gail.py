@@ -11,16 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.algorithms.discriminator import (
+from oodil.pipeline.algorithms.discriminator import (
     Discriminator,
     imitation_reward,
     mean_logit_per_demonstration,
 )
-from pipeline.algorithms.learner import side_by_side
-from pipeline.config import DiscriminatorConfig
-from pipeline.data import Demonstrations
-from pipeline.rollout import Rollout
-from pipeline.seeding import derive_key, generator, torch_seed
+from oodil.pipeline.algorithms.learner import side_by_side
+from oodil.pipeline.config import DiscriminatorConfig
+from oodil.pipeline.data import Demonstrations, Rollout
+from oodil.pipeline.seeding import derive_key, numpy_rng, torch_seed
 
 
 class AdversarialReward:
@@ -66,9 +65,9 @@ class AdversarialReward:
     def update(self, rollouts: list[Rollout], iteration: int, step_scale: float) -> dict[str, float]:
         """Step the discriminator on the rollouts against as many demonstration pairs, or all of them if fewer."""
         config = self.discriminator.config
-        self.discriminator.optimiser.learning_rate = config.learning_rate * step_scale
+        self.discriminator.optimizer.learning_rate = config.learning_rate * step_scale
         policy_pairs = self._policy_pairs(rollouts)
-        rng = generator(derive_key(self.root_seed, "discriminator", iteration))
+        rng = numpy_rng(derive_key(self.root_seed, "discriminator", iteration))
         count = min(len(self._starts), len(policy_pairs))
         metrics: dict[str, float] = {}
         for _ in range(config.steps_per_iteration):
@@ -79,12 +78,12 @@ class AdversarialReward:
         """Go on with the discriminator alone, against rollouts of a policy that no longer learns.
 
         While both learn, a discriminator is always behind: for a while even an imitator that fails may fool it. Each of
-        the ``steps`` draws ``batch_size`` pairs from either side. The optimiser begins anew: its moments are of a
+        the ``steps`` draws ``batch_size`` pairs from either side. The optimizer begins anew: its moments are of a
         policy that moved, and its steps had shrunk.
         """
-        self.discriminator.restart_optimiser()
+        self.discriminator.restart_optimizer()
         policy_pairs = self._policy_pairs(rollouts)
-        rng = generator(derive_key(self.root_seed, "discriminator", "settle"))
+        rng = numpy_rng(derive_key(self.root_seed, "discriminator", "settle"))
         for _ in range(steps):
             chosen = torch.from_numpy(rng.integers(len(policy_pairs), size=batch_size))
             self.discriminator.update(self.draw(batch_size, rng), policy_pairs[chosen])
@@ -101,15 +100,15 @@ class AdversarialReward:
         return mean_logit_per_demonstration(self.discriminator, demonstrations)
 
     def state(self) -> dict[str, Tensor]:
-        """Return the discriminator and its optimiser."""
+        """Return the discriminator and its optimizer."""
         state = {f"net/{name}": value for name, value in self.discriminator.state_dict().items()}
-        return state | {f"optimiser/{name}": value for name, value in self.discriminator.optimiser.state().items()}
+        return state | {f"optimizer/{name}": value for name, value in self.discriminator.optimizer.state().items()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Continue from `state`."""
         self.discriminator.load_state_dict({k[4:]: v for k, v in state.items() if k.startswith("net/")})
-        moments = {k[10:]: v for k, v in state.items() if k.startswith("optimiser/")}
-        self.discriminator.optimiser.load_state(moments)
+        moments = {k[10:]: v for k, v in state.items() if k.startswith("optimizer/")}
+        self.discriminator.optimizer.load_state(moments)
 
     def _policy_pairs(self, rollouts: list[Rollout]) -> Tensor:
         """Return B pairs: each state with its successor, step by step, groups side by side."""

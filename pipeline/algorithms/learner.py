@@ -1,4 +1,4 @@
-"""One on-policy learner for every use: a generator, a value function, and a source of reward.
+"""One on-policy learner for every use: a policy optimizer, a value function, and a source of reward.
 
 An iteration is: reward from the model as it stands -> advantages -> policy step -> value fit -> the reward model's own
 step. Experts learn from the environment's reward, imitators from a discriminator; nothing else differs.
@@ -13,16 +13,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.algorithms.advantages import generalised_advantages, standardised
-from pipeline.algorithms.networks import PolicyNetwork
-from pipeline.algorithms.optimiser import Adam
-from pipeline.algorithms.ppo import Ppo
-from pipeline.algorithms.trpo import Trpo
-from pipeline.algorithms.value import ValueFunction
-from pipeline.config import TrainingConfig
-from pipeline.policy import GaussianPolicy
-from pipeline.rollout import Rollout
-from pipeline.seeding import derive_key, torch_seed
+from oodil.pipeline.algorithms.advantages import generalized_advantages, standardized
+from oodil.pipeline.algorithms.networks import PolicyNetwork
+from oodil.pipeline.algorithms.optimizer import Adam
+from oodil.pipeline.algorithms.ppo import Ppo
+from oodil.pipeline.algorithms.trpo import Trpo
+from oodil.pipeline.algorithms.value import ValueFunction
+from oodil.pipeline.config import TrainingConfig
+from oodil.pipeline.data import Rollout
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.seeding import derive_key, torch_seed
 
 SMALLEST_DEVIATION = 1e-4
 """A state dimension that varies less than this is not blown up any further."""
@@ -90,18 +90,18 @@ class Learner:
         with torch.no_grad():
             self.policy.log_std.fill_(config.initial_log_std)
         self.value = ValueFunction(observation_dim, config.value, rng)
-        self.generator = (
-            Trpo(self.policy, config.generator)
-            if config.generator.kind == "trpo"
-            else Ppo(self.policy, config.generator)
+        self.policy_optimizer = (
+            Trpo(self.policy, config.policy_optimizer)
+            if config.policy_optimizer.kind == "trpo"
+            else Ppo(self.policy, config.policy_optimizer)
         )
         moments = reward_model.state_moments()
-        self._tracks_moments = config.normalise_observations and moments is None
-        if config.normalise_observations and moments is not None:
-            self._normalise_by(*(torch.from_numpy(moment) for moment in moments))
+        self._tracks_moments = config.normalize_observations and moments is None
+        if config.normalize_observations and moments is not None:
+            self._normalize_by(*(torch.from_numpy(moment) for moment in moments))
         self._moments = torch.zeros(1 + 2 * observation_dim, dtype=torch.float64)
 
-    def behaviour_policy(self) -> GaussianPolicy:
+    def behavior_policy(self) -> GaussianPolicy:
         """Return a copy of the present policy, ready to be sent."""
         return self.policy.export()
 
@@ -120,17 +120,17 @@ class Learner:
         flat = observations.flatten(0, 1)
         if self._tracks_moments:
             self._track(flat)
-        inputs = self.policy.normalise(flat)
+        inputs = self.policy.normalize(flat)
         values, next_values = self._values(inputs, rollouts, terminated | truncated)
-        advantages = generalised_advantages(
+        advantages = generalized_advantages(
             rewards, values, next_values, terminated, truncated, config.discount, config.gae_lambda
         )
         metrics = {"reward": float(rewards.mean())}
-        metrics |= self.generator.update(
+        metrics |= self.policy_optimizer.update(
             flat,
             actions.flatten(0, 1),
             log_probs.flatten(),
-            torch.from_numpy(standardised(advantages)).flatten(),
+            torch.from_numpy(standardized(advantages)).flatten(),
             rng,
             step_scale,
         )
@@ -149,19 +149,19 @@ class Learner:
         apart = ended.copy()
         apart[-1] = True
         next_observations = side_by_side([r.next_observations for r in rollouts])[apart]
-        next_values[apart] = self.value(self.policy.normalise(torch.from_numpy(next_observations))).numpy()
+        next_values[apart] = self.value(self.policy.normalize(torch.from_numpy(next_observations))).numpy()
         return values, next_values
 
     @torch.no_grad()
     def _track(self, observations: Tensor) -> None:
-        """Move the input normaliser to the mean and deviation of all observations so far."""
+        """Move the input normalizer to the mean and deviation of all observations so far."""
         wide = observations.double()
         self._moments += torch.cat((torch.tensor([float(len(wide))]), wide.sum(0), wide.square().sum(0)))
         count, (total, squares) = self._moments[0], self._moments[1:].view(2, -1)
         mean = total / count
-        self._normalise_by(mean, (squares / count - mean.square()).clamp_min(0).sqrt())
+        self._normalize_by(mean, (squares / count - mean.square()).clamp_min(0).sqrt())
 
-    def _normalise_by(self, mean: Tensor, deviation: Tensor) -> None:
+    def _normalize_by(self, mean: Tensor, deviation: Tensor) -> None:
         self.policy.input_mean.copy_(mean)
         self.policy.input_scale.copy_(1 / deviation.clamp_min(SMALLEST_DEVIATION))
 
@@ -187,4 +187,8 @@ class Learner:
             part.load_state(below(name))
 
     def _parts(self) -> dict[str, RewardModel | Trpo | Ppo | Adam]:
-        return {"generator": self.generator, "value_optimiser": self.value.optimiser, "reward_model": self.reward_model}
+        return {
+            "policy_optimizer": self.policy_optimizer,
+            "value_optimizer": self.value.optimizer,
+            "reward_model": self.reward_model,
+        }

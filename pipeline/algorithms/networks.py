@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from pipeline.policy import GaussianPolicy
+from oodil.pipeline.policy import GaussianPolicy
 
 
 class MLP(nn.Module):
@@ -90,13 +90,13 @@ class PolicyNetwork(nn.Module):
         self.register_buffer("input_mean", torch.zeros(observation_dim))
         self.register_buffer("input_scale", torch.ones(observation_dim))
 
-    def normalise(self, observations: Tensor) -> Tensor:
+    def normalize(self, observations: Tensor) -> Tensor:
         """Return (B, S) observations as the network sees them."""
         return (observations - self.input_mean) * self.input_scale
 
     def forward(self, observations: Tensor) -> Tensor:
         """Return (B, A) mean actions."""
-        return self.net(self.normalise(observations))
+        return self.net(self.normalize(observations))
 
     def gradients(self, loss: Tensor, mean: Tensor, layer_inputs: list[Tensor]) -> list[Tensor]:
         """Return the gradient of each parameter, ordered as `parameters()`.
@@ -108,9 +108,9 @@ class PolicyNetwork(nn.Module):
 
     def log_prob(self, mean: Tensor, actions: Tensor) -> Tensor:
         """Return (B,) log-densities of ``actions`` (B, A) under the Gaussian with this ``mean`` (B, A)."""
-        standardised = (actions - mean) * torch.exp(-self.log_std)
+        standardized = (actions - mean) * torch.exp(-self.log_std)
         constant = 0.5 * float(np.log(2 * np.pi)) * actions.shape[-1]
-        return -0.5 * standardised.square().sum(-1) - self.log_std.sum() - constant
+        return -0.5 * standardized.square().sum(-1) - self.log_std.sum() - constant
 
     def export(self) -> GaussianPolicy:
         """Return a copy for rollout workers."""

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation with the clipped surrogate (Schulman et al. 2017), https://arxiv.org/abs/1707.06347.
+"""Proximal policy optimization with the clipped surrogate (Schulman et al. 2017), https://arxiv.org/abs/1707.06347.
 
 Letters: B batch, S observation, A action.
 """
@@ -6,9 +6,9 @@ Letters: B batch, S observation, A action.
 import torch
 from torch import Tensor
 
-from pipeline.algorithms.networks import PolicyNetwork
-from pipeline.algorithms.optimiser import Adam
-from pipeline.config import PpoConfig
+from oodil.pipeline.algorithms.networks import PolicyNetwork
+from oodil.pipeline.algorithms.optimizer import Adam
+from oodil.pipeline.config import PpoConfig
 
 
 def clipped_surrogate(log_probs: Tensor, old_log_probs: Tensor, advantages: Tensor, clip: float) -> Tensor:
@@ -18,20 +18,20 @@ def clipped_surrogate(log_probs: Tensor, old_log_probs: Tensor, advantages: Tens
 
 
 class Ppo:
-    """Several epochs of minibatch gradient steps per batch; its state is the optimiser's."""
+    """Several epochs of minibatch gradient steps per batch; its state is the optimizer's."""
 
     def __init__(self, policy: PolicyNetwork, config: PpoConfig) -> None:
         self.policy = policy
         self.config = config
-        self._optimiser = Adam(list(policy.parameters()), config.learning_rate)
+        self._optimizer = Adam(list(policy.parameters()), config.learning_rate)
 
     def state(self) -> dict[str, Tensor]:
-        """Return the optimiser's moments."""
-        return self._optimiser.state()
+        """Return the optimizer's moments."""
+        return self._optimizer.state()
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Continue from `state`."""
-        self._optimiser.load_state(state)
+        self._optimizer.load_state(state)
 
     def update(
         self,
@@ -49,8 +49,8 @@ class Ppo:
         Returns metrics: kl (of the last minibatch, estimated), entropy.
         """
         config, policy = self.config, self.policy
-        self._optimiser.learning_rate = config.learning_rate * step_scale
-        inputs = policy.normalise(observations)
+        self._optimizer.learning_rate = config.learning_rate * step_scale
+        inputs = policy.normalize(observations)
         kl = 0.0
         for _ in range(config.epochs):
             for chosen in torch.randperm(len(observations), generator=rng).split(config.minibatch_size):
@@ -61,6 +61,6 @@ class Ppo:
                 loss = -clipped_surrogate(new, old, advantages[chosen], config.clip)
                 if config.entropy_bonus:
                     loss = loss - config.entropy_bonus * policy.log_std.sum()
-                self._optimiser.apply(policy.gradients(loss, mean, layer_inputs), config.max_grad_norm)
+                self._optimizer.apply(policy.gradients(loss, mean, layer_inputs), config.max_grad_norm)
                 kl = float((old - new.detach()).mean())
         return {"kl": kl, "entropy": float(policy.log_std.detach().sum()) + 1.4189385 * len(policy.log_std)}

@@ -1,4 +1,4 @@
-"""Trust region policy optimisation (Schulman et al. 2015), https://arxiv.org/abs/1502.05477.
+"""Trust region policy optimization (Schulman et al. 2015), https://arxiv.org/abs/1502.05477.
 
 The step solves F x = g by conjugate gradients with Fisher-vector products computed forward-mode through the mean
 network (one pass forward, one backward, no second derivatives), then halves it until the surrogate improves inside the
@@ -12,8 +12,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pipeline.algorithms.networks import PolicyNetwork
-from pipeline.config import TrpoConfig
+from oodil.pipeline.algorithms.networks import PolicyNetwork
+from oodil.pipeline.config import TrpoConfig
 
 
 def conjugate_gradient(product: Callable[[Tensor], Tensor], b: Tensor, iterations: int, tolerance: float) -> Tensor:
@@ -66,14 +66,14 @@ class Trpo:
         Args:
             observations, actions: (B, S) and (B, A).
             log_probs: (B,) under the policy that acted; it may be one version behind.
-            advantages: (B,) standardised.
-            rng: unused; every generator has the same signature.
+            advantages: (B,) standardized.
+            rng: unused; every policy optimizer has the same signature.
             step_scale: factor on the trust region.
         Returns metrics: kl, improvement, step_fraction (0 when the step was refused), entropy.
         """
         config, policy = self.config, self.policy
         max_kl = config.max_kl * step_scale
-        inputs = policy.normalise(observations)
+        inputs = policy.normalize(observations)
         layer_inputs = policy.net.layer_inputs(inputs)
         mean = policy.net.head(layer_inputs).requires_grad_()
         surrogate = (torch.exp(policy.log_prob(mean, actions) - log_probs) * advantages).mean()

@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor, nn
 
-from pipeline.algorithms.networks import MLP
-from pipeline.algorithms.optimiser import Adam
-from pipeline.config import ValueConfig
+from oodil.pipeline.algorithms.networks import MLP
+from oodil.pipeline.algorithms.optimizer import Adam
+from oodil.pipeline.config import ValueConfig
 
 
 class ValueFunction(nn.Module):
@@ -15,10 +15,10 @@ class ValueFunction(nn.Module):
         super().__init__()
         self.config = config
         self.net = MLP(observation_dim, config.hidden, 1, rng)
-        self.optimiser = Adam(list(self.parameters()), config.learning_rate)
+        self.optimizer = Adam(list(self.parameters()), config.learning_rate)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Return (B,) values of (B, S) normalised observations."""
+        """Return (B,) values of (B, S) normalized observations."""
         return self.net(inputs).squeeze(-1)
 
     def fit(self, inputs: Tensor, targets: Tensor, rng: torch.Generator) -> dict[str, float]:
@@ -32,5 +32,5 @@ class ValueFunction(nn.Module):
                 errors = self.net.head(layer_inputs).squeeze(-1) - some_targets
                 # Of the mean squared error.
                 gradient = errors * (2 / len(errors))
-                self.optimiser.apply(self.net.gradients(layer_inputs, gradient.unsqueeze(-1)))
+                self.optimizer.apply(self.net.gradients(layer_inputs, gradient.unsqueeze(-1)))
         return {"value_loss": float(errors.square().mean())}

@@ -6,8 +6,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from pipeline.data import DataError, Demonstrations
-from pipeline.datasets import minari, robomimic
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.datasets import minari, robomimic
+from oodil.pipeline.errors import DataError
 
 TARGETS = "FILE.csv (a new table), FILE.hdf5 (masks and attributes) or minari:DATASET_ID (episode metadata)"
 

@@ -3,8 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
-from pipeline.data import DataError, Demonstrations, Episode
-from pipeline.datasets import minari, npz, official, robomimic
+from oodil.pipeline.data import Demonstrations, Episode
+from oodil.pipeline.datasets import minari, npz, official, robomimic
+from oodil.pipeline.errors import DataError
 
 _MINARI = "minari:"
 FORMATS = "FILE.npz, FILE.hdf5 (robomimic), FILE.pkl (released code) or minari:DATASET_ID"

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import DataError, Demonstrations, Episode
+from oodil.pipeline.data import Demonstrations, Episode
+from oodil.pipeline.errors import DataError
 
 
 def read(dataset_id: str, keys: tuple[str, ...]) -> tuple[list[Episode], str]:

@@ -7,7 +7,8 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from pipeline.data import DataError, Demonstrations
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.errors import DataError
 
 SCHEMA = "1"
 _HEADER = "oodil"

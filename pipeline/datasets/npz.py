@@ -5,7 +5,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from pipeline.data import DataError, Episode
+from oodil.pipeline.data import Episode
+from oodil.pipeline.errors import DataError
 
 
 def read(path: Path) -> list[Episode]:

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.data import DataError, Episode
+from oodil.pipeline.data import Episode
+from oodil.pipeline.errors import DataError
 
 _ALLOWED = {
     ("numpy", "ndarray"),

@@ -12,20 +12,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from oodil.pipeline.data import Snapshot
+
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 """All that MuJoCo's next step depends on. `mjSTATE_FULLPHYSICS` is not: it leaves out the solver's warm start."""
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """Everything that the future of G simulators depends on."""
-
-    states: NDArray[np.float64]
-    """(G, N); what it means is the batch's own affair. MuJoCo's integration states, or a seed and actions."""
-    elapsed_steps: NDArray[np.int64]
-    """(G,) steps since the last reset."""
-    episode_returns: NDArray[np.float64]
-    """(G,) sum of the environment's own reward since the last reset; for evaluation only."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
-from pipeline.environments.batch import Snapshot, StepOutcome
+from oodil.pipeline.data import Snapshot
+from oodil.pipeline.environments.batch import StepOutcome
 
 Floats = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from gymnasium.envs.mujoco import half_cheetah_v5, hopper_v5, walker2d_v5
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
-from pipeline.environments.batch import MujocoBatch, StepOutcome
+from oodil.pipeline.environments.batch import MujocoBatch, StepOutcome
 
 Floats = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
-from pipeline.environments.batch import MujocoBatch, StepOutcome
+from oodil.pipeline.environments.batch import MujocoBatch, StepOutcome
 
 Floats = NDArray[np.float64]
 
@@ -288,7 +288,7 @@ def _compile(working: tuple[int, ...]) -> mujoco.MjModel:
             body.gravcomp = 1.0
             for geom in body.geoms:
                 if geom.contype or geom.conaffinity:
-                    # It meets box and table, not itself: a link that is fixed to the base would touch its neighbour.
+                    # It meets box and table, not itself: a link that is fixed to the base would touch its neighbor.
                     geom.contype, geom.conaffinity = 2, 1
             for joint in list(body.joints):
                 if joint.name not in map(_joint_name, working):

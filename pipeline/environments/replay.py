@@ -12,7 +12,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.environments.batch import Snapshot, StepOutcome
+from oodil.pipeline.data import Snapshot
+from oodil.pipeline.environments.batch import StepOutcome
+from oodil.pipeline.errors import UnusableEnvironmentError
 
 _TRIAL_STEPS = 20
 
@@ -109,7 +111,7 @@ class ReplayBatch:
 
 
 def refuse_randomness(batch: ReplayBatch, env_id: str) -> None:
-    """Raise ValueError if the same seed and actions can lead to different states: nothing could be resumed then."""
+    """Raise UnusableEnvironmentError if the same seed and actions can lead to different states."""
     rng = np.random.default_rng(0)
     actions = rng.standard_normal((_TRIAL_STEPS, 1, batch.action_dim), dtype=np.float32)
     traces = []
@@ -122,7 +124,7 @@ def refuse_randomness(batch: ReplayBatch, env_id: str) -> None:
         traces.append(np.concatenate(trace))
     if traces[0].tobytes() != traces[1].tobytes():
         step = int(np.flatnonzero((traces[0] != traces[1]).any(axis=1))[0])
-        raise ValueError(
+        raise UnusableEnvironmentError(
             f"environment {env_id!r} is not deterministic: after reset(seed=1), the same actions led to another "
             f"state at step {step}; it must draw from self.np_random alone"
         )

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from pipeline.artifacts import write_file
-from pipeline.report.page import render
-from pipeline.stage import Run
+from oodil.pipeline.artifacts import write_file
+from oodil.pipeline.report.page import render
+from oodil.pipeline.stage import Run
 
 __all__ = ["write_report"]
 

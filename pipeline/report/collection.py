@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.report.figures import Look, source_looks
-from pipeline.results import Results
+from oodil.pipeline.report.figures import Look, source_looks
+from oodil.pipeline.results import Results
 
 
 @dataclass(frozen=True)

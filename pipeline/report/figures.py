@@ -1,7 +1,7 @@
 """The figures of the report, each as one SVG element. They hold no text of the user, so the page brings the legends.
 
-Sources keep one colour and one marker throughout: blues can be reproduced by the imitator, oranges cannot, so the eye
-sees at once whether the two were told apart. Blue and orange stay apart in every common form of colour blindness.
+Sources keep one color and one marker throughout: blues can be reproduced by the imitator, oranges cannot, so the eye
+sees at once whether the two were told apart. Blue and orange stay apart in every common form of color blindness.
 Letters: N demonstrations, K clusters, E embedding, M points of a curve.
 """
 
@@ -85,14 +85,14 @@ STYLE: dict[str, Any] = {
 class Look:
     """How a source is drawn in every figure and legend."""
 
-    colour: str
+    color: str
     marker: str
     glyph: str
 
     @property
     def text(self) -> str:
-        """The colour of text on this colour."""
-        red, green, blue = (int(self.colour[i : i + 2], 16) for i in (1, 3, 5))
+        """The color of text on this color."""
+        red, green, blue = (int(self.color[i : i + 2], 16) for i in (1, 3, 5))
         return "#fff" if 0.299 * red + 0.587 * green + 0.114 * blue < 140 else INK
 
 
@@ -107,7 +107,7 @@ class Curve:
 
 
 def source_looks(transferable: Iterable[bool | None]) -> list[Look]:
-    """Return one look per source; a marker changes when the colours of its family are used up."""
+    """Return one look per source; a marker changes when the colors of its family are used up."""
     transferable = list(transferable)
     families = {True: TRANSFERABLE, False: NOT_TRANSFERABLE, None: UNKNOWN}
     if set(transferable) != {None}:
@@ -166,12 +166,12 @@ def embedding(
                 fontsize=8, fontweight="bold", bbox=box, zorder=5,
             )  # fmt: skip
         for i in _largest_first(sources):
-            _dots(right, points[sources == i], looks[i].colour, looks[i].marker, size, len(points))
+            _dots(right, points[sources == i], looks[i].color, looks[i].marker, size, len(points))
     return svg.getvalue()
 
 
 def transferability(scores: NDArray[np.float64], sources: NDArray[np.int32], looks: list[Look]) -> str:
-    """Draw the (N,) scores from the highest to the lowest, coloured by source (N,); beside it a column per source."""
+    """Draw the (N,) scores from the highest to the lowest, colored by source (N,); beside it a column per source."""
     order = np.argsort(-scores, kind="stable")
     rank = np.empty(len(scores))
     rank[order] = np.arange(1, len(scores) + 1)
@@ -183,11 +183,11 @@ def transferability(scores: NDArray[np.float64], sources: NDArray[np.int32], loo
         size = float(np.clip(5000 / len(scores), 9, 48))
         for i in _largest_first(sources):
             mine = sources == i
-            stems = axes.vlines(rank[mine], 0, scores[mine], color=looks[i].colour, linewidth=width, alpha=0.30)
+            stems = axes.vlines(rank[mine], 0, scores[mine], color=looks[i].color, linewidth=width, alpha=0.30)
             stems.set_capstyle("butt")
             stems.set_rasterized(len(scores) > MOST_AS_VECTORS)
             points = np.stack([rank[mine], scores[mine]], axis=1)
-            _dots(axes, points, looks[i].colour, looks[i].marker, size, len(scores))
+            _dots(axes, points, looks[i].color, looks[i].marker, size, len(scores))
         axes.set_xlim(0.5 - 0.008 * len(scores), len(scores) * 1.008 + 0.5)
         _score_axis(axes, float(scores.max()))
         ticks = [tick for tick in MaxNLocator(8, integer=True).tick_values(1, len(scores)) if 1 < tick <= len(scores)]
@@ -211,11 +211,11 @@ def _columns(
             continue
         spread = (np.arange(len(mine)) * 0.618034) % 1.0 - 0.5  # evenly spread whatever their number, and always alike
         x = i + 0.6 * spread * min(1.0, len(mine) / 30)
-        _dots(axes, np.stack([x, mine], axis=1), look.colour, look.marker, 0.7 * size, len(scores))
+        _dots(axes, np.stack([x, mine], axis=1), look.color, look.marker, 0.7 * size, len(scores))
         axes.hlines(mine.mean(), i - 0.42, i + 0.42, color=INK, linewidth=1.6, zorder=4)
 
 
-def convergence(histories: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]], colours: dict[int, str]) -> str:
+def convergence(histories: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]], colors: dict[int, str]) -> str:
     """Draw one panel per cluster: (M,) environment steps and (M, N_k) scores, as mean and 10 to 90 % band."""
     columns = min(len(histories), 5)
     rows = -(-len(histories) // columns)
@@ -228,8 +228,8 @@ def convergence(histories: dict[int, tuple[NDArray[np.float64], NDArray[np.float
             axes.tick_params(labelbottom=True)
         for axes, (k, (env_steps, scores)) in zip(panels.flat, histories.items(), strict=False):
             low, high = np.quantile(scores, (0.1, 0.9), axis=1)
-            axes.fill_between(env_steps, low, high, color=colours[k], alpha=0.22, linewidth=0)
-            axes.plot(env_steps, scores.mean(axis=1), color=colours[k], linewidth=1.8)
+            axes.fill_between(env_steps, low, high, color=colors[k], alpha=0.22, linewidth=0)
+            axes.plot(env_steps, scores.mean(axis=1), color=colors[k], linewidth=1.8)
             axes.set_title(f"cluster {k}", fontweight="bold")
             axes.set_title(f"N = {scores.shape[1]}", loc="right", fontsize=7.5, color=MUTED)
             _score_axis(axes, highest, note=False)
@@ -244,13 +244,13 @@ def learning(ours: Curve | None, naive: Curve | None, oracle_return: float | Non
     with _drawing("learning", 11, 3.7) as (figure, svg):
         axes = figure.subplots()
         ends: list[tuple[float, str, str]] = []
-        for curve, colour, width in ((naive, "#98a0ad", 1.8), (ours, INK, 2.4)):
+        for curve, color, width in ((naive, "#98a0ad", 1.8), (ours, INK, 2.4)):
             if curve is None:
                 continue
             low, high = curve.mean - curve.std, curve.mean + curve.std
-            axes.fill_between(curve.env_steps, low, high, color=colour, alpha=0.16, linewidth=0)
-            axes.plot(curve.env_steps, curve.mean, color=colour, linewidth=width, marker="o", markersize=3.2)
-            ends.append((float(curve.mean[-1]), curve.name, colour))
+            axes.fill_between(curve.env_steps, low, high, color=color, alpha=0.16, linewidth=0)
+            axes.plot(curve.env_steps, curve.mean, color=color, linewidth=width, marker="o", markersize=3.2)
+            ends.append((float(curve.mean[-1]), curve.name, color))
         if oracle_return is not None:
             axes.axhline(oracle_return, color=TRANSFERABLE[0], linewidth=1.4, linestyle=(0, (5, 3)))
             ends.append((oracle_return, "oracle", TRANSFERABLE[0]))
@@ -271,11 +271,11 @@ def _name_lines(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
     low, high = axes.get_ylim()
     apart = 0.065 * (high - low)
     placed = -np.inf
-    for value, name, colour in sorted(ends):
+    for value, name, color in sorted(ends):
         placed = max(value, placed + apart)
         axes.annotate(
             name, (1.0, placed), xytext=(8, 0), xycoords=("axes fraction", "data"), textcoords="offset points",
-            color=colour, va="center", fontweight="bold", annotation_clip=False,
+            color=color, va="center", fontweight="bold", annotation_clip=False,
         )  # fmt: skip
 
 
@@ -285,9 +285,9 @@ def _largest_first(sources: NDArray[np.int32]) -> list[int]:
     return [int(i) for i in present[np.argsort(-counts, kind="stable")]]
 
 
-def _dots(axes: Axes, points: NDArray[np.float64], colour: str, marker: str, size: float, total: int) -> None:
+def _dots(axes: Axes, points: NDArray[np.float64], color: str, marker: str, size: float, total: int) -> None:
     axes.scatter(
-        points[:, 0], points[:, 1], s=size, c=colour, marker=marker, linewidths=0.35, edgecolors="white", zorder=3,
+        points[:, 0], points[:, 1], s=size, c=color, marker=marker, linewidths=0.35, edgecolors="white", zorder=3,
         rasterized=total > MOST_AS_VECTORS,
     )  # fmt: skip
 

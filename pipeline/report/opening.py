@@ -3,9 +3,9 @@
 from html import escape
 from typing import Any
 
-from pipeline.report import figures, pieces
-from pipeline.report.collection import Collection
-from pipeline.results import Results
+from oodil.pipeline.report import figures, pieces
+from oodil.pipeline.report.collection import Collection
+from oodil.pipeline.results import Results
 
 FEW_EPISODES = 20
 """Below this a mean return is called rough."""
@@ -42,7 +42,7 @@ def headline(results: Results, collection: Collection | None) -> str:
 
 
 def _families(collection: Collection) -> str:
-    """Say what the colours mean."""
+    """Say what the colors mean."""
     meanings = {True: "Blue: known to be transferable to the imitator.", False: "Orange: known not to be."}
     told = [meaning for known, meaning in meanings.items() if any(s.transferable is known for s in collection.sources)]
     return pieces.caption(" ".join(told)) if told else ""
@@ -157,7 +157,7 @@ def notes(results: Results, collection: Collection | None) -> str:
     before, after = scores.get("transferable_share_before"), scores.get("transferable_share")
     if before is not None and after is not None and after <= before:
         told.append(
-            "Weighting did not raise the transferable share: the scores do not favour what is transferable. Jobs that "
+            "Weighting did not raise the transferable share: the scores do not favor what is transferable. Jobs that "
             "are too short are the usual cause."
         )
     stability = results.json("clustering", "diagnostics.json").get("label_stability")

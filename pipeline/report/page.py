@@ -7,12 +7,12 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from pipeline.report import figures, opening, pieces
-from pipeline.report.collection import Collection, Source, read_collection
-from pipeline.report.figures import Curve
-from pipeline.report.style import CSS
-from pipeline.results import STAGES, Results
-from pipeline.stage import Run
+from oodil.pipeline.report import figures, opening, pieces
+from oodil.pipeline.report.collection import Collection, Source, read_collection
+from oodil.pipeline.report.figures import Curve
+from oodil.pipeline.report.style import CSS
+from oodil.pipeline.results import STAGES, Results
+from oodil.pipeline.stage import Run
 
 QUALITY = (
     ("silhouette", "silhouette", 3),
@@ -107,7 +107,7 @@ def _mass_bars(collection: Collection, before: NDArray[np.float64], after: NDArr
 
 
 def _segment(source: Source, share: float) -> str:
-    style = f"flex:{share:.5f};background:{source.look.colour};color:{source.look.text}"
+    style = f"flex:{share:.5f};background:{source.look.color};color:{source.look.text}"
     shown = pieces.percent(share) if share >= 0.05 else ""
     return f'<span style="{style}" title="{escape(source.label)}: {pieces.percent(share)}">{shown}</span>'
 
@@ -140,16 +140,16 @@ def _convergence(results: Results, collection: Collection) -> str:
     clusters = sorted(int(name.split("/")[0].removeprefix("cluster_")) for name in history if name.endswith("/scores"))
     if not clusters:
         return ""
-    histories, colours = {}, {}
+    histories, colors = {}, {}
     for k in clusters:
         histories[k] = (history[f"cluster_{k}/env_steps"].astype(np.float64), history[f"cluster_{k}/scores"])
         members = collection.source_of[history[f"cluster_{k}/demonstrations"]]
-        colours[k] = collection.looks[int(np.bincount(members).argmax())].colour
+        colors[k] = collection.looks[int(np.bincount(members).argmax())].color
     caption = (
         "Scores while the job of each cluster ran: mean and the range of the middle 80 % of its demonstrations, in the "
-        "colour of its most frequent source. A curve that still moves at its end asks for a longer job."
+        "color of its most frequent source. A curve that still moves at its end asks for a longer job."
     )
-    drawn = pieces.figure(figures.convergence(histories, colours), "Scores of each cluster over environment steps")
+    drawn = pieces.figure(figures.convergence(histories, colors), "Scores of each cluster over environment steps")
     return f"<h3>Did the scores settle?</h3>\n{pieces.caption(caption)}\n{drawn}"
 
 
@@ -165,7 +165,7 @@ def _clustering_section(results: Results, collection: Collection | None) -> str:
         points, projection = projected
         drawn = pieces.caption(
             f"The embedding of the demonstrations, brought to two dimensions by {projection}"
-            + (", in which only neighbourhoods mean something, not distances." if projection == "t-SNE" else ".")
+            + (", in which only neighborhoods mean something, not distances." if projection == "t-SNE" else ".")
             + " The method sees no sources; they are shown to judge it."
         )
         drawn += pieces.legend(collection.sources)
@@ -205,8 +205,8 @@ def _contingency(results: Results, collection: Collection, diagnostics: dict[str
 
 
 def _heat(count: int, share: float) -> str:
-    colour = "#fff" if share > 0.55 else "inherit" if count else "#b9c0ca"
-    return f'<td style="background:rgba(47,72,110,{0.05 + 0.85 * share:.3f});color:{colour}">{count}</td>'
+    color = "#fff" if share > 0.55 else "inherit" if count else "#b9c0ca"
+    return f'<td style="background:rgba(47,72,110,{0.05 + 0.85 * share:.3f});color:{color}">{count}</td>'
 
 
 def _provenance_section(results: Results) -> str:

@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 from html import escape
 
-from pipeline.report.collection import Source
-from pipeline.results import shown_return
+from oodil.pipeline.report.collection import Source
+from oodil.pipeline.results import shown_return
 
 TITLES = {
     "demonstrations": "demonstrations",
@@ -45,14 +45,14 @@ def missing(text: str) -> str:
 
 
 def legend(sources: Iterable[Source], counts: bool = False) -> str:
-    """Return the list of sources with their colours and markers."""
+    """Return the list of sources with their colors and markers."""
     items = "".join(f"<li>{name(source)}{f' ({source.count})' if counts else ''}</li>" for source in sources)
     return f'<ul class="legend">{items}</ul>\n'
 
 
 def name(source: Source) -> str:
-    """Return a source's label with its colour and marker before it."""
-    swatch = f'<span class="swatch" style="color:{source.look.colour}">{source.look.glyph}</span>'
+    """Return a source's label with its color and marker before it."""
+    swatch = f'<span class="swatch" style="color:{source.look.color}">{source.look.glyph}</span>'
     return swatch + escape(source.label or "unnamed")
 
 

@@ -3,13 +3,14 @@
 A stage loads what it computes with inside ``run_job``, so that reading a run, or starting one, does not wait for torch.
 """
 
-from pipeline.config import RunConfig
-from pipeline.stage import Stage
-from pipeline.stages.clustering import ClusteringStage
-from pipeline.stages.demonstrations import DemonstrationsStage
-from pipeline.stages.experts import ExpertsStage
-from pipeline.stages.imitation import ImitationStage, NaiveGailStage, OracleStage
-from pipeline.stages.transferability import TransferabilityStage
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.errors import ConfigError
+from oodil.pipeline.stage import Stage
+from oodil.pipeline.stages.clustering import ClusteringStage
+from oodil.pipeline.stages.demonstrations import DemonstrationsStage
+from oodil.pipeline.stages.experts import ExpertsStage
+from oodil.pipeline.stages.imitation import ImitationStage, NaiveGailStage, OracleStage
+from oodil.pipeline.stages.transferability import TransferabilityStage
 
 
 def stages(config: RunConfig) -> list[Stage]:
@@ -20,8 +21,8 @@ def stages(config: RunConfig) -> list[Stage]:
 
 
 def stage_named(config: RunConfig, name: str) -> Stage:
-    """Return a stage of the run by its name. Raises LookupError, naming those there are, if there is none."""
+    """Return a stage of the run by its name. Raises ConfigError, naming those there are, if there is none."""
     for stage in (*stages(config), ExpertsStage()):
         if stage.name == name:
             return stage
-    raise LookupError(f"no stage {name!r}; this run has {', '.join(stage.name for stage in stages(config))}")
+    raise ConfigError(f"no stage {name!r}; this run has {', '.join(stage.name for stage in stages(config))}")

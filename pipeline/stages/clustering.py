@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.artifacts import Files, encode_arrays, encode_json
-from pipeline.config import RunConfig
-from pipeline.data import Demonstrations
-from pipeline.stage import JobContext, JobStoppedError, Run, Stage
-from pipeline.stages.demonstrations import load_demonstrations
+from oodil.pipeline.artifacts import Files, encode_arrays, encode_json
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.stage import JobContext, JobStoppedError, Run, Stage
+from oodil.pipeline.stages.demonstrations import load_demonstrations
 
 if TYPE_CHECKING:
-    from pipeline.algorithms.clustering import ContrastiveClustering, Labelling
+    from oodil.pipeline.algorithms.clustering import ContrastiveClustering, Labelling
 
 
 class ClusteringStage(Stage):
-    """Contrastive clustering of whole demonstrations (`pipeline.algorithms.clustering`)."""
+    """Contrastive clustering of whole demonstrations (`oodil.pipeline.algorithms.clustering`)."""
 
     name = "clustering"
     version = 1
@@ -31,7 +31,7 @@ class ClusteringStage(Stage):
         return config.clustering.model_dump(mode="json")
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
-        """Train the encoder and the centres, or continue from a checkpoint, and label every demonstration.
+        """Train the encoder and the centers, or continue from a checkpoint, and label every demonstration.
 
         Returns:
             assignment.safetensors: labels (N,) int32 and features (N, E) float32.
@@ -41,7 +41,7 @@ class ClusteringStage(Stage):
         import torch
         from threadpoolctl import threadpool_limits
 
-        from pipeline.algorithms.clustering import ContrastiveClustering
+        from oodil.pipeline.algorithms.clustering import ContrastiveClustering
 
         torch.set_num_threads(1)
         # scikit-learn and NumPy have threads of their own, and sums depend on how many take part.
@@ -51,7 +51,7 @@ class ClusteringStage(Stage):
             self._train(clustering, run, job, context)
             model = clustering.model()
             labelling = model.label(demonstrations, run.config.clustering.label_draws, run.config.seed)
-            report = diagnostics(labelling, demonstrations, len(model.centres))
+            report = diagnostics(labelling, demonstrations, len(model.centers))
             report["shortened_subtrajectories"] = model.sampling.num_shortened(demonstrations.lengths)
         return {
             "assignment.safetensors": encode_arrays({"labels": labelling.labels, "features": labelling.features}),

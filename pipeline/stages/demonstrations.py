@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import Files, encode_json
-from pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
-from pipeline.data import DataError, Demonstrations
-from pipeline.datasets import decode_demonstrations, encode_demonstrations, read_demonstrations
-from pipeline.environments import make_batch
-from pipeline.experts import collect_demonstrations, hand_written, load_expert
-from pipeline.stage import JobContext, Run, Stage
+from oodil.pipeline.artifacts import Files, encode_json
+from oodil.pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.datasets import decode_demonstrations, encode_demonstrations, read_demonstrations
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.errors import DataError
+from oodil.pipeline.experts import collect_demonstrations, hand_written, load_expert
+from oodil.pipeline.stage import JobContext, Run, Stage
 
 FILE = "demonstrations.safetensors"
 

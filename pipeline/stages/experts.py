@@ -8,14 +8,14 @@ sees it.
 from pathlib import Path
 from typing import Any
 
-from pipeline.artifacts import Files, encode_json, write_artifact
-from pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
-from pipeline.evaluation import evaluate
-from pipeline.experts import EXPERT_TRAINING, expert_files, train_expert
-from pipeline.policy import GaussianPolicy
-from pipeline.seeding import derive_key
-from pipeline.stage import JobContext, Run, Stage
-from pipeline.versions import library_versions
+from oodil.pipeline.artifacts import Files, encode_json, write_artifact
+from oodil.pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
+from oodil.pipeline.evaluation import evaluate
+from oodil.pipeline.experts import EXPERT_TRAINING, expert_files, train_expert
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.seeding import derive_key
+from oodil.pipeline.stage import JobContext, Run, Stage
+from oodil.pipeline.versions import library_versions
 
 TRAININGS = 2
 """Seeds tried per source."""

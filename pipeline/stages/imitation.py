@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.artifacts import Files, encode_arrays, encode_json
-from pipeline.config import RunConfig
-from pipeline.data import Demonstrations
-from pipeline.environments import make_batch
-from pipeline.evaluation import evaluate
-from pipeline.seeding import derive_key, torch_seed
-from pipeline.stage import JobContext, Run, Stage
-from pipeline.stages.demonstrations import load_demonstrations
+from oodil.pipeline.artifacts import Files, encode_arrays, encode_json
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.evaluation import evaluate
+from oodil.pipeline.seeding import derive_key, torch_seed
+from oodil.pipeline.stage import JobContext, Run, Stage
+from oodil.pipeline.stages.demonstrations import load_demonstrations
 
 
 class ImitationStage(Stage):
@@ -33,9 +33,9 @@ class ImitationStage(Stage):
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Train the policy and evaluate it with its mean action."""
-        from pipeline.algorithms.gail import AdversarialReward
-        from pipeline.algorithms.learner import Learner
-        from pipeline.training import Probe, train
+        from oodil.pipeline.algorithms.gail import AdversarialReward
+        from oodil.pipeline.algorithms.learner import Learner
+        from oodil.pipeline.training import Probe, train
 
         config = run.config
         gail = config.imitation.gail
@@ -50,13 +50,13 @@ class ImitationStage(Stage):
         def curve_point() -> NDArray[np.float64]:
             key = derive_key(config.seed, "curve")
             seen = evaluate(
-                learner.behaviour_policy(), environment.id, environment.dynamics, gail.evaluation_episodes, key
+                learner.behavior_policy(), environment.id, environment.dynamics, gail.evaluation_episodes, key
             )
             return np.array([seen.returns.mean(), seen.returns.std(), seen.lengths.mean()])
 
         probe = Probe("curve", gail.num_evaluations, curve_point)
         history = train(learner, environment, gail, [probe], context, self.checkpoints(run, job))
-        policy = learner.behaviour_policy()
+        policy = learner.behavior_policy()
         episodes = config.imitation.final_episodes
         final = evaluate(policy, environment.id, environment.dynamics, episodes, derive_key(config.seed, "final"))
         curve = history.values("curve").reshape(-1, 3)

@@ -10,23 +10,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.algorithms.transferability import (
+from oodil.pipeline.algorithms.weights import (
     sampling_mass,
     share_lasted,
     sharpened_weights,
     transferability,
 )
-from pipeline.artifacts import Files, encode_arrays, encode_json
-from pipeline.config import RunConfig
-from pipeline.data import Demonstrations
-from pipeline.environments import make_batch
-from pipeline.seeding import derive_key, torch_seed
-from pipeline.stage import JobContext, Run, Stage
-from pipeline.stages.demonstrations import load_demonstrations, transferable_mask
+from oodil.pipeline.artifacts import Files, encode_arrays, encode_json
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.seeding import derive_key, torch_seed
+from oodil.pipeline.stage import JobContext, Run, Stage
+from oodil.pipeline.stages.demonstrations import load_demonstrations, transferable_mask
 
 if TYPE_CHECKING:
-    from pipeline.algorithms.gail import AdversarialReward
-    from pipeline.algorithms.learner import Learner
+    from oodil.pipeline.algorithms.gail import AdversarialReward
+    from oodil.pipeline.algorithms.learner import Learner
 
 _JOB_FILE = "scores.safetensors"
 
@@ -46,8 +46,8 @@ class ClusterJob:
     @classmethod
     def of(cls, run: Run, job: str) -> "ClusterJob":
         """Return the job of that name, untrained."""
-        from pipeline.algorithms.gail import AdversarialReward
-        from pipeline.algorithms.learner import Learner
+        from oodil.pipeline.algorithms.gail import AdversarialReward
+        from oodil.pipeline.algorithms.learner import Learner
 
         environment, gail = run.config.environment, run.config.transferability.gail
         members = np.flatnonzero(_labels(run) == _cluster(job))
@@ -60,11 +60,11 @@ class ClusterJob:
 
     def settle(self, context: JobContext) -> int:
         """Let the discriminator go on against the imitator as it is now; return the environment steps it saw."""
-        from pipeline.training import experience
+        from oodil.pipeline.training import experience
 
         environment, section = self.config.environment, self.config.transferability
         horizon = make_batch(environment.id, environment.dynamics, 1).max_episode_steps
-        policy = self.learner.behaviour_policy()
+        policy = self.learner.behavior_policy()
         rollouts = experience(policy, environment, section.gail, horizon, self.seed, context)
         self.reward.settle(rollouts, section.final_steps, section.gail.steps_per_iteration)
         return sum(rollout.terminated.size for rollout in rollouts)
@@ -119,7 +119,7 @@ class TransferabilityStage(Stage):
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Imitate one cluster in the imitator's environment and score its demonstrations along the way."""
-        from pipeline.training import Probe, train
+        from oodil.pipeline.training import Probe, train
 
         config, gail = run.config, run.config.transferability.gail
         cluster = ClusterJob.of(run, job)
@@ -138,7 +138,7 @@ class TransferabilityStage(Stage):
                 }
             ),
             "discriminator.safetensors": encode_arrays(discriminator),
-            "policy.safetensors": encode_arrays(cluster.learner.behaviour_policy().arrays()),
+            "policy.safetensors": encode_arrays(cluster.learner.behavior_policy().arrays()),
         }
 
     def combine(self, run: Run) -> Files:

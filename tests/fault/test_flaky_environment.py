@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.data import Demonstrations
-from pipeline.datasets import encode_demonstrations
-from pipeline.environments import make_batch
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.datasets import encode_demonstrations
+from oodil.pipeline.environments import make_batch
 from tests.flaky import FOLDER_VARIABLE, MISDEEDS, allow
 from tests.runs import MICRO, LiveRun, artifacts, has_checkpoint, nothing_left, run, wait_for
 

@@ -10,17 +10,28 @@ from pathlib import Path
 
 import pytest
 
-import pipeline.rollout
-from pipeline.rollout import InlineRollouts, Unit, UnitResult, collect
-from pipeline.stage import JobStoppedError
-from pipeline.versions import collecting_versions
+import oodil.pipeline.collecting
+from oodil.pipeline.collecting import InlineRollouts, collect
+from oodil.pipeline.data import Unit, UnitResult
+from oodil.pipeline.stage import JobStoppedError
+from oodil.pipeline.versions import collecting_versions
+from oodil.workers import learner, rollout
+from oodil.workers.channels import Dealer, private_endpoint
+from oodil.workers.messages import (
+    Header,
+    Message,
+    Ready,
+    Refused,
+    ResultMessage,
+    UnitFailure,
+    UnitMessage,
+    decode,
+    encode,
+)
+from oodil.workers.supervisor import Died, Restarts, Started, Supervisor
+from oodil.workers.supervisor import Event as ChildEvent
+from oodil.workers.zmq_rollouts import CollectError, Dispatcher, ZmqRollouts
 from tests.fakes import chain, hopper_units, wait_until
-from workers import learner, rollout
-from workers.channels import Dealer, private_endpoint
-from workers.learner import CollectError, Dispatcher, ZmqRollouts
-from workers.messages import Header, Message, Ready, Refused, ResultMessage, UnitFailure, UnitMessage, decode, encode
-from workers.supervisor import Died, Restarts, Started, Supervisor
-from workers.supervisor import Event as ChildEvent
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -124,7 +135,7 @@ def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
             return collect(unit)
 
     monkeypatch.setattr(rollout, "collect", collect_alone)
-    monkeypatch.setattr(pipeline.rollout, "collect", collect_alone)
+    monkeypatch.setattr(oodil.pipeline.collecting, "collect", collect_alone)
 
 
 def inline(units: list[Unit]) -> list[UnitResult]:
@@ -225,7 +236,7 @@ def test_late_units_go_to_a_worker_with_nothing_to_do(
     workers = Threads(endpoint, 1)
     try:
         assert_same_bits(source.gather(), inline(units))
-        hoarder.send(pipeline.rollout.collect(held[0]))
+        hoarder.send(oodil.pipeline.collecting.collect(held[0]))
         wait_until(lambda: source.dropped == {"duplicate": 1})
     finally:
         workers.close()
@@ -244,7 +255,7 @@ def test_a_unit_that_fails_once_is_given_to_another_worker(
         second.ready()
         wait_until(lambda: len(source._dispatcher._workers) == 2)
         first.fail(unit)
-        second.send(pipeline.rollout.collect(second.next_unit()))
+        second.send(oodil.pipeline.collecting.collect(second.next_unit()))
         assert_same_bits(source.gather(), inline(units))
     finally:
         first.close()

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from oodil.workers.channels import endpoint_folder
+from oodil.workers.engine import Event, JobFailed, JobWarning, LocalEngine, WorkerRestarted
+from oodil.workers.reports import Progress
+from oodil.workers.supervisor import Died, Ended, Link, Restarts, Said, Started, Supervisor
+from oodil.workers.supervisor import Event as ChildEvent
 from tests.fakes import STAGES, FakeStage, fake_run, lines, wait_until
-from workers.channels import endpoint_folder
-from workers.engine import Event, JobFailed, JobWarning, LocalEngine, WorkerRestarted
-from workers.reports import Progress
-from workers.supervisor import Died, Ended, Link, Restarts, Said, Started, Supervisor
-from workers.supervisor import Event as ChildEvent
 
 pytestmark = pytest.mark.timeout(120)
 ROOT = Path(__file__).parents[2]
@@ -222,7 +222,7 @@ def test_nothing_is_left_when_the_orchestrator_is_killed(tmp_path: Path, distrib
     code = f"""
 from pathlib import Path
 from tests.fakes import FakeStage, STAGES, fake_run
-from workers.engine import LocalEngine
+from oodil.workers.engine import LocalEngine
 
 if __name__ == "__main__":
     run = fake_run(Path({str(tmp_path)!r}))

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from oodil.workers.channels import new_key_pair
+from oodil.workers.keys import create_learner_keys, create_worker_keys
 from tests.runs import MICRO, ROOT, LiveRun, artifacts, has_checkpoint, nothing_left, run, wait_for
-from workers.channels import new_key_pair
-from workers.keys import create_learner_keys, create_worker_keys
 
 pytestmark = pytest.mark.timeout(300)
 

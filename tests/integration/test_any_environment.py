@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.data import Demonstrations
-from pipeline.datasets import encode_demonstrations
-from pipeline.environments import make_batch
-from pipeline.evaluation import run_episodes
-from pipeline.policy import GaussianPolicy
-from pipeline.seeding import generator
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.datasets import encode_demonstrations
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.evaluation import run_episodes
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.seeding import numpy_rng
 from tests.runs import MICRO, LiveRun, artifacts, has_checkpoint, nothing_left, run, wait_for
 
 pytestmark = pytest.mark.timeout(300)
@@ -28,7 +28,7 @@ def pushing(strength: float, gravity: float) -> Demonstrations:
         input_scale=np.ones(3, np.float32),
     )
     simulators = make_batch(PENDULUM, {"g": gravity}, 4)
-    return Demonstrations.of(run_episodes(simulators, policy, generator((0,)), stochastic=False), f"g {gravity}")
+    return Demonstrations.of(run_episodes(simulators, policy, numpy_rng((0,)), stochastic=False), f"g {gravity}")
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from oodil.workers import channels
+from oodil.workers.channels import Dealer, EndpointError, Router, endpoint_folder, private_endpoint
 from tests.fakes import wait_until
-from workers import channels
-from workers.channels import Dealer, EndpointError, Router, endpoint_folder, private_endpoint
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -11,9 +11,9 @@ import safetensors.numpy
 import yaml
 from typer.testing import CliRunner
 
-from orchestrator import app
-from pipeline.data import Demonstrations
-from pipeline.datasets import encode_demonstrations
+from oodil.cli import app
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.datasets import encode_demonstrations
 from tests.runs import MICRO, ROOT
 
 HOPPER = "oodil/Hopper-v0"
@@ -54,7 +54,7 @@ def config_for(tmp_path: Path):
     [
         ("clustering.num_cluster=3", "unknown key 'clustering.num_cluster'; did you mean 'num_clusters'?"),
         ("sed=3", "unknown key 'sed'; did you mean 'seed'?"),
-        ("imitation.gail.generator.max_kll=1", "did you mean 'max_kl'?"),
+        ("imitation.gail.policy_optimizer.max_kll=1", "did you mean 'max_kl'?"),
         ("seed=soon", "seed: Input should be a valid integer"),
         ("clustering.temperature=-1", "clustering.temperature: Input should be greater than 0, got -1"),
         ("environment.id=oodil/Hoper-v0", "oodil/Hoper-v0"),

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.algorithms.transferability import sampling_mass
-from pipeline.artifacts import RunDirectory, encode_arrays, write_artifact
-from pipeline.data import Demonstrations
-from pipeline.datasets import encode_demonstrations
-from pipeline.environments import make_batch
-from pipeline.evaluation import run_episodes
-from pipeline.experts import load_expert
-from pipeline.loading import parse_config
-from pipeline.seeding import generator
-from pipeline.stage import Run
-from pipeline.stages.transferability import TransferabilityStage
+from oodil.pipeline.algorithms.weights import sampling_mass
+from oodil.pipeline.artifacts import RunDirectory, encode_arrays, write_artifact
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.datasets import encode_demonstrations
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.evaluation import run_episodes
+from oodil.pipeline.experts import load_expert
+from oodil.pipeline.loading import parse_config
+from oodil.pipeline.seeding import numpy_rng
+from oodil.pipeline.stage import Run
+from oodil.pipeline.stages.transferability import TransferabilityStage
+from oodil.workers.engine import LocalEngine
 from tests.runs import ROOT
-from workers.engine import LocalEngine
 
 pytestmark = pytest.mark.timeout(1200)
 
@@ -38,7 +38,7 @@ def test_an_expert_is_transferable_and_doing_nothing_is_not(tmp_path: Path) -> N
     # As the demonstrations of a run, the expert's are of sampled actions and full length; the idle robot takes none.
     for policy, label, falls in ((expert, "expert", False), (idle, "does nothing", True)):
         simulators = make_batch("oodil/Hopper-v0", OWN, 2 * COUNT)
-        episodes = run_episodes(simulators, policy, generator((0,)), stochastic=not falls)
+        episodes = run_episodes(simulators, policy, numpy_rng((0,)), stochastic=not falls)
         wanted = [episode for episode in episodes if episode.terminated == falls]
         parts.append(Demonstrations.of(wanted[:COUNT], label))
     demonstrations = Demonstrations.joined(parts)

@@ -14,11 +14,12 @@ import pytest
 from minari.data_collector import EpisodeBuffer
 from typer.testing import CliRunner
 
-from orchestrator import app
-from pipeline.data import DataError, Demonstrations, Episode
-from pipeline.datasets import read_demonstrations
-from pipeline.datasets.export import export
-from pipeline.datasets.foreign import read_foreign
+from oodil.cli import app
+from oodil.pipeline.data import Demonstrations, Episode
+from oodil.pipeline.datasets import read_demonstrations
+from oodil.pipeline.datasets.export import export
+from oodil.pipeline.datasets.foreign import read_foreign
+from oodil.pipeline.errors import DataError
 from tests.minari_sets import save_minari
 
 HOPPER = "oodil/Hopper-v0"

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from pipeline.algorithms.transferability import transferability
-from pipeline.environments.locomotion import HopperEnv
-from pipeline.loading import load_config
+from oodil.pipeline.algorithms.weights import transferability
+from oodil.pipeline.environments.locomotion import HopperEnv
+from oodil.pipeline.loading import load_config
 from tests.runs import MICRO, artifacts, run
 
 pytestmark = pytest.mark.timeout(600)
@@ -63,15 +63,15 @@ class NanHopper(HopperEnv):
 
 def test_a_reward_of_nan_trains_to_the_same_bits(inline: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     gymnasium.register("oodil/NanHopper-v0", entry_point=NanHopper, max_episode_steps=1000)
-    from pipeline.artifacts import RunDirectory
-    from pipeline.stage import Run
-    from pipeline.stages import stages
-    from workers.engine import LocalEngine
+    from oodil.pipeline.artifacts import RunDirectory
+    from oodil.pipeline.stage import Run
+    from oodil.pipeline.stages import stages
+    from oodil.workers.engine import LocalEngine
 
     config = load_config(MICRO, [NAIVE, "environment.id=oodil/NanHopper-v0"])
     poisoned = Run(config, RunDirectory(tmp_path / "run"))
     sound = Run(load_config(MICRO, [NAIVE]), RunDirectory(inline))
-    from pipeline.artifacts import write_artifact
+    from oodil.pipeline.artifacts import write_artifact
 
     for stage in stages(config):
         outcome = LocalEngine(0).run_jobs(stage, poisoned, stage.jobs(poisoned), lambda _: None, lambda: False)

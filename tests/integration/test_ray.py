@@ -10,17 +10,17 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
-from pipeline.artifacts import read_artifact
-from pipeline.loading import load_config
-from pipeline.policy import GaussianPolicy
-from pipeline.rollout import InlineRollouts
-from pipeline.stages import stages
+from oodil.orchestrator import open_run, walk
+from oodil.pipeline.artifacts import read_artifact
+from oodil.pipeline.collecting import InlineRollouts
+from oodil.pipeline.loading import load_config
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.stages import stages
+from oodil.workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, LocalEngine, Outcome
+from oodil.workers.ray_engine import RayEngine, RayRollouts, connect
 from tests.fakes import STAGES, FakeStage, chain, fake_run, hopper_units, lines, wait_until
 from tests.flaky import FOLDER_VARIABLE
 from tests.runs import MICRO
-from walk import open_run, walk
-from workers.cluster import RayEngine, RayRollouts, connect
-from workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, LocalEngine, Outcome
 
 pytestmark = pytest.mark.timeout(300)
 

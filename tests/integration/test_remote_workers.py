@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from orchestrator import app
-from pipeline.stage import Run
+from oodil.cli import app
+from oodil.pipeline.stage import Run
+from oodil.workers.channels import Access, Dealer, Router, new_key_pair
+from oodil.workers.engine import LocalEngine
+from oodil.workers.keys import KeysError, client_keys, create_learner_keys, create_worker_keys, server_keys
+from oodil.workers.messages import Header, Ready, encode
 from tests.fakes import STAGES, FakeStage, fake_run, lines
 from tests.runs import ROOT
-from workers.channels import Access, Dealer, Router, new_key_pair
-from workers.engine import LocalEngine
-from workers.keys import KeysError, client_keys, create_learner_keys, create_worker_keys, server_keys
-from workers.messages import Header, Ready, encode
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -136,9 +136,9 @@ def test_remote_workers_alone_do_the_work(access: Access, tmp_path: Path) -> Non
     remote = remote_worker(access, keys, tmp_path / "logs")
     run = fake_run(tmp_path / "run")
     (run.directory.path / "go").touch()
-    from pipeline.rollout import InlineRollouts
+    from oodil.pipeline.collecting import InlineRollouts
+    from oodil.workers.zmq_rollouts import ZmqRollouts
     from tests.fakes import hopper_units
-    from workers.learner import ZmqRollouts
 
     source = ZmqRollouts(f"ipc://{tmp_path}/s", "a run", "learner.1", 60.0, access=access)
     inline = InlineRollouts()
@@ -196,7 +196,7 @@ def test_keys_are_made_once_and_kept_from_others(access: Access) -> None:
 def test_a_worker_with_other_libraries_ends_with_the_reason(
     access: Access, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from workers import learner as learner_module
+    from oodil.workers import learner as learner_module
 
     monkeypatch.setattr(learner_module, "collecting_versions", lambda: "mujoco 0.0.0")
     remote = remote_worker(access, create_worker_keys(access.keys, "elsewhere", new_key_pair), tmp_path / "logs")

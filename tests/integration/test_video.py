@@ -14,8 +14,8 @@ from tests.runs import ROOT
 PROGRAM = """
 import sys
 from pathlib import Path
-from pipeline.evaluation import film
-from pipeline.experts import load_expert
+from oodil.pipeline.evaluation import film
+from oodil.pipeline.experts import load_expert
 policy, _ = load_expert(Path("configs/experts/hopper-gravity-9.8"))
 print(film(policy, "oodil/Hopper-v0", {"gravity": 9.8}, 0, Path(sys.argv[1])))
 """

@@ -14,7 +14,7 @@ import pytest
 from minari.data_collector import EpisodeBuffer
 from safetensors.numpy import load_file
 
-from pipeline.environments import make_batch
+from oodil.pipeline.environments import make_batch
 from tests.minari_sets import save_minari
 from tests.runs import ROOT
 

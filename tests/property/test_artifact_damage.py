@@ -11,15 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from pipeline.artifacts import (
-    MANIFEST,
-    DamagedArtifactError,
-    encode_arrays,
-    encode_json,
-    fingerprint,
-    read_artifact,
-    write_artifact,
-)
+from oodil.pipeline.artifacts import MANIFEST, encode_arrays, encode_json, fingerprint, read_artifact, write_artifact
+from oodil.pipeline.errors import DamagedArtifactError
 
 SETTINGS = settings(max_examples=50)
 

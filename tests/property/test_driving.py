@@ -7,11 +7,12 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.environments import make_batch
-from pipeline.environments.driving import GOAL, DrivingBatch, DrivingEnv, layout, touches
-from pipeline.evaluation import run_episodes
-from pipeline.experts import hand_written
-from pipeline.seeding import generator
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.environments.driving import GOAL, DrivingBatch, DrivingEnv, layout, touches
+from oodil.pipeline.errors import OodilError
+from oodil.pipeline.evaluation import run_episodes
+from oodil.pipeline.experts import hand_written
+from oodil.pipeline.seeding import numpy_rng
 
 ID = "oodil/Driving-v0"
 SHARES = st.floats(0.05, 0.45)
@@ -87,7 +88,7 @@ def test_a_snapshot_continues_to_the_same_bits() -> None:
 @pytest.mark.parametrize("name", SOURCES)
 def test_the_driver_reaches_the_goal_in_its_own_world(name: str) -> None:
     cars = make_batch(ID, SOURCES[name], 60)
-    episodes = run_episodes(cars, hand_written(cars, ID), generator((0,)), stochastic=False)
+    episodes = run_episodes(cars, hand_written(cars, ID), numpy_rng((0,)), stochastic=False)
     assert all(episode.env_return > -500 for episode in episodes), "the goal was not reached"
     speeds = {round(float(np.hypot(*episode.states[-1][2:4])), 4) for episode in episodes}
     assert speeds == {SOURCES[name]["speed"]}
@@ -98,5 +99,5 @@ def test_the_driver_reaches_the_goal_in_its_own_world(name: str) -> None:
     [({"obstacle_1": 1.2}, "obstacle_1 is 1.2"), ({"speed": 0.0}, "speed is 0.0"), ({"gravity": 1.0}, "gravity")],
 )
 def test_a_world_that_cannot_be_is_refused(dynamics: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(OodilError, match=message):
         make_batch(ID, dynamics, 1)

@@ -13,13 +13,22 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 from numpy.typing import NDArray
 
-from pipeline.environments import Snapshot
-from pipeline.policy import GaussianPolicy
-from pipeline.rollout import Rollout, Unit, UnitResult
-from workers import messages
-from workers.messages import Header, Message, Ready, Refused, ResultMessage, UnitFailure, UnitMessage, decode, encode
-from workers.reports import Failed, Finished, Progress, Report, Silent, Stop, Warn, decode_report, encode_report
-from workers.wire import MessageError, shortened
+from oodil.pipeline.data import Rollout, Snapshot, Unit, UnitResult
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.workers import messages
+from oodil.workers.messages import (
+    Header,
+    Message,
+    Ready,
+    Refused,
+    ResultMessage,
+    UnitFailure,
+    UnitMessage,
+    decode,
+    encode,
+)
+from oodil.workers.reports import Failed, Finished, Progress, Report, Silent, Stop, Warn, decode_report, encode_report
+from oodil.workers.wire import MessageError, shortened
 
 texts = st.text(max_size=50)
 plain_texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=50)

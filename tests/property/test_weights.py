@@ -4,9 +4,9 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipeline.algorithms.gail import AdversarialReward
-from pipeline.config import DiscriminatorConfig
-from pipeline.data import Demonstrations
+from oodil.pipeline.algorithms.gail import AdversarialReward
+from oodil.pipeline.config import DiscriminatorConfig
+from oodil.pipeline.data import Demonstrations
 
 SETTINGS = settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -69,5 +69,5 @@ def test_only_weighted_transitions_within_one_demonstration(pairs, seed):
 def test_the_scale_of_the_weights_does_not_matter(pairs, scale):
     one = build(pairs)[0].draw(2000, Grid()).numpy()
     two = build([(length, weight * scale) for length, weight in pairs])[0].draw(2000, Grid()).numpy()
-    # Rounding may move a point that lies on a border to the neighbour.
+    # Rounding may move a point that lies on a border to the neighbor.
     assert (one != two).any(axis=1).sum() <= len(pairs) * 12

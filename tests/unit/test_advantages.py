@@ -1,9 +1,9 @@
-"""Generalised advantage estimation by hand and against the definition."""
+"""Generalized advantage estimation by hand and against the definition."""
 
 import numpy as np
 import pytest
 
-from pipeline.algorithms.advantages import generalised_advantages, standardised
+from oodil.pipeline.algorithms.advantages import generalized_advantages, standardized
 
 
 def column(*values, dtype=np.float32):
@@ -14,7 +14,7 @@ def three_steps(terminated=(), truncated=()):
     """Rewards 1, 2, 3; values 10, 20, 30; next values 20, 30, 40; discount 0.5, lambda 0.4, so the decay is 0.2."""
     ends = [column(*(t in when for t in range(3)), dtype=np.bool_) for when in (terminated, truncated)]
     rewards, values, following = column(1, 2, 3), column(10, 20, 30), column(20, 30, 40)
-    return generalised_advantages(rewards, values, following, *ends, discount=0.5, gae_lambda=0.4)[:, 0]
+    return generalized_advantages(rewards, values, following, *ends, discount=0.5, gae_lambda=0.4)[:, 0]
 
 
 def test_by_hand_without_an_end():
@@ -64,7 +64,7 @@ def test_against_the_defining_sum(discount, gae_lambda):
     rewards, values, next_values = (rng.standard_normal(shape).astype(np.float32) for _ in range(3))
     terminated, truncated = rng.random(shape) < 0.1, rng.random(shape) < 0.1
     arguments = (rewards, values, next_values, terminated, truncated, discount, gae_lambda)
-    result = generalised_advantages(*arguments)
+    result = generalized_advantages(*arguments)
     assert result.dtype == np.float32
     np.testing.assert_allclose(result, reference(*arguments), rtol=1e-4, atol=1e-5)
 
@@ -75,13 +75,13 @@ def test_with_lambda_one_advantage_plus_value_is_the_discounted_return():
     terminated = np.zeros((30, 1), np.bool_)
     terminated[-1] = True
     next_values = np.concatenate((values[1:], np.full((1, 1), 99, np.float32)))
-    result = generalised_advantages(rewards, values, next_values, terminated, ~terminated & False, 0.9, 1.0)
+    result = generalized_advantages(rewards, values, next_values, terminated, ~terminated & False, 0.9, 1.0)
     returns = [sum(0.9**k * float(rewards[t + k, 0]) for k in range(30 - t)) for t in range(30)]
     np.testing.assert_allclose((result + values)[:, 0], returns, rtol=1e-4, atol=1e-5)
 
 
-def test_standardised():
-    result = standardised(np.array([[1, 2], [3, 6]], np.float32))
+def test_standardized():
+    result = standardized(np.array([[1, 2], [3, 6]], np.float32))
     # mean 3, deviations -2, -1, 0, 3, variance 14 / 4
     np.testing.assert_allclose(result, np.array([[-2, -1], [0, 3]]) / np.sqrt(3.5), rtol=1e-6)
-    assert not standardised(np.full((2, 2), 7, np.float32)).any()
+    assert not standardized(np.full((2, 2), 7, np.float32)).any()

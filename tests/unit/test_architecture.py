@@ -25,13 +25,26 @@ UNSAFE_MODULES = {
 }
 UNSAFE_CALLS = {"torch.load", "torch.save", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "np.load", "numpy.load"}
 UNSAFE_METHODS = {"send_pyobj", "recv_pyobj"}
+COMMAND_LINE = ("cli", "terminal", "bench")
+TOP = ("orchestrator", *COMMAND_LINE)
+BOTTOM = {
+    "errors": (),
+    "config": (),
+    "seeding": (),
+    "policy": (),
+    "artifacts": ("errors",),
+    "data": ("errors", "policy", "seeding"),
+}
+"""What the files at the bottom of the pipeline may import of ours."""
 CONVERTERS = {"pipeline/datasets/official.py"}
 """The one file that may read foreign pickles."""
 
 
 def sources() -> list[str]:
-    """Return all source files of the program, relative to the root."""
-    found = [path for folder in ("pipeline", "workers", "examples") for path in (ROOT / folder).rglob("*.py")]
+    """Return all source files of the program, relative to the root, each under one name: links are not followed."""
+    folders = ("pipeline", "workers", "examples")
+    found = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    found += [path for path in (ROOT / "src" / "oodil").glob("*.py") if not path.is_symlink()]
     return sorted(str(path.relative_to(ROOT)) for path in [*found, *ROOT.glob("*.py")])
 
 
@@ -62,10 +75,17 @@ def packages(tree: ast.Module) -> set[str]:
 
 
 def forbidden_imports(name: str, tree: ast.Module) -> set[str]:
-    """Return what a file imports against the order orchestrator -> workers -> pipeline."""
-    top = {"orchestrator", "walk", "terminal", "bench"}
-    above = {"pipeline": {"workers", *top}, "workers": top}
-    return packages(tree) & above.get(name.split("/")[0], {"orchestrator"})
+    """Return what a file imports against the order command line -> orchestrator -> workers -> pipeline.
+
+    Nothing imports ``pipeline`` or ``workers`` by themselves: a module would then exist twice.
+    """
+    used = set(imported(tree))
+    found = {each for each in used if each.split(".")[0] in ("pipeline", "workers", "orchestrator")}
+    above = {"pipeline": ("workers", *TOP), "workers": TOP, "orchestrator.py": COMMAND_LINE}
+    if name == "orchestrator.py":
+        used -= {"oodil.cli.main"}  # ``python orchestrator.py`` is the command line
+    higher = tuple(f"oodil.{module}" for module in above.get(name.split("/")[0], ()))
+    return found | {each for each in used if each.startswith(higher)}
 
 
 def starts_processes(tree: ast.Module) -> set[str]:
@@ -119,20 +139,22 @@ def test_nothing_is_unpickled(name):
 
 def test_the_bottom_stays_at_the_bottom():
     """Configuration, data, files and seeds know nothing of what is built on them."""
-    for name in ("config", "data", "artifacts", "seeding", "policy"):
-        assert "pipeline" not in packages(parse(f"pipeline/{name}.py")), name
+    for name, below in BOTTOM.items():
+        ours = {each.rpartition(".")[0] for each in imported(parse(f"pipeline/{name}.py")) if each.startswith("oodil")}
+        assert ours <= {f"oodil.pipeline.{module}" for module in below}, name
     for path in (ROOT / "pipeline" / "algorithms").rglob("*.py"):
         names = set(imported(parse(str(path.relative_to(ROOT)))))
-        assert not {name for name in names if name.startswith(("pipeline.stage", "pipeline.report"))}, path
+        assert not {name for name in names if name.startswith(("oodil.pipeline.stage", "oodil.pipeline.report"))}, path
 
 
 @pytest.mark.parametrize(
     ("file", "text", "check"),
     [
-        ("pipeline/a.py", "def f():\n    import workers.engine", forbidden_imports),
-        ("pipeline/stages/a.py", "from orchestrator import main", forbidden_imports),
-        ("workers/a.py", "import orchestrator", forbidden_imports),
-        ("examples/a.py", "import orchestrator", forbidden_imports),
+        ("pipeline/a.py", "def f():\n    import oodil.workers.engine", forbidden_imports),
+        ("pipeline/stages/a.py", "from oodil.orchestrator import execute", forbidden_imports),
+        ("workers/a.py", "import oodil.orchestrator", forbidden_imports),
+        ("examples/a.py", "from pipeline.data import Demonstrations", forbidden_imports),
+        ("orchestrator.py", "from oodil.terminal import Display", forbidden_imports),
         ("a.py", "from multiprocessing import Process", starts_processes),
         ("a.py", "import concurrent.futures", starts_processes),
         ("a.py", "import os\nos.fork()", starts_processes),
@@ -157,7 +179,7 @@ def test_the_checks_notice(file, text, check):
 @pytest.mark.parametrize(
     ("file", "text"),
     [
-        ("workers/a.py", "from pipeline.rollout import collect"),
+        ("workers/a.py", "from oodil.pipeline.collecting import collect"),
         ("workers/a.py", "import os\nos.getpid()"),
         ("pipeline/a.py", "import numpy as np\nnp.load('a', allow_pickle=False)"),
         ("pipeline/a.py", "import yaml\nyaml.safe_load('a')"),
@@ -177,7 +199,10 @@ def loaded_by(module: str) -> set[str]:
     return set(result.stdout.split())
 
 
-@pytest.mark.parametrize("module", ["pipeline.rollout", "workers.rollout", "pipeline.stages", "walk"])
+@pytest.mark.parametrize(
+    "module",
+    ["oodil.pipeline.collecting", "oodil.workers.rollout_worker", "oodil.pipeline.stages", "oodil.orchestrator"],
+)
 def test_rollout_workers_and_the_orchestrator_start_without_torch(module):
     loaded = loaded_by(module)
     assert "mujoco" in loaded

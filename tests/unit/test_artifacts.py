@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from pipeline.artifacts import (
+from oodil.pipeline.artifacts import (
     MANIFEST,
     Checkpoints,
-    DamagedArtifactError,
     RunDirectory,
     encode_arrays,
     encode_json,
@@ -22,6 +21,7 @@ from pipeline.artifacts import (
     remove_artifact,
     write_artifact,
 )
+from oodil.pipeline.errors import DamagedArtifactError
 
 OLD = {"a.json": b"old a", "b.bin": b"old b"}
 NEW = {"a.json": b"new a", "c.bin": b"new c"}

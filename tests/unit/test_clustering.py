@@ -1,4 +1,4 @@
-"""Assignment, centres and the whole of Algorithm 1; the stage gives the same bytes however often it is stopped."""
+"""Assignment, centers and the whole of Algorithm 1; the stage gives the same bytes however often it is stopped."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,20 +9,21 @@ import pytest
 import torch
 from sklearn.metrics import calinski_harabasz_score, silhouette_score
 
-from pipeline.algorithms.clustering import (
+from oodil.pipeline.algorithms.clustering import (
     ClusterModel,
     ContrastiveClustering,
     Labelling,
     assign,
-    centre_loss,
-    moved_centres,
+    center_loss,
+    moved_centers,
 )
-from pipeline.artifacts import RunDirectory, write_artifact
-from pipeline.config import ClusteringConfig, RunConfig
-from pipeline.data import DataError, Demonstrations
-from pipeline.stage import JobStoppedError, Run
-from pipeline.stages import clustering as stage_module
-from pipeline.stages.clustering import ClusteringStage, contingency, diagnostics, purity
+from oodil.pipeline.artifacts import RunDirectory, write_artifact
+from oodil.pipeline.config import ClusteringConfig, RunConfig
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.errors import DataError
+from oodil.pipeline.stage import JobStoppedError, Run
+from oodil.pipeline.stages import clustering as stage_module
+from oodil.pipeline.stages.clustering import ClusteringStage, contingency, diagnostics, purity
 
 SMALL = {"hidden": 16, "warmup_iterations": 30, "joint_iterations": 40, "batch_size": 16}
 
@@ -48,36 +49,36 @@ def three_dynamics(counts: tuple[int, int, int], seed: int = 0) -> Demonstration
     )
 
 
-def test_the_nearest_centre_is_by_distance_also_when_centres_have_unequal_lengths():
-    centres = torch.tensor([[1.0, 0.0], [0.2, 0.2], [-3.0, 0.0]])
+def test_the_nearest_center_is_by_distance_also_when_centers_have_unequal_lengths():
+    centers = torch.tensor([[1.0, 0.0], [0.2, 0.2], [-3.0, 0.0]])
     features = torch.tensor([[0.9, 0.1], [0.0, 1.0], [-1.0, 0.0]])
     # Squared distances: (.02, .50, 15.2), (2, .68, 10), (4, 1.48, 4).
-    assert assign(features, centres).tolist() == [0, 1, 1]
-    assert assign(features[None], centres).tolist() == [[0, 1, 1]]
+    assert assign(features, centers).tolist() == [0, 1, 1]
+    assert assign(features[None], centers).tolist() == [[0, 1, 1]]
 
 
-def test_the_centre_loss_by_hand():
+def test_the_center_loss_by_hand():
     features = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
     own = torch.tensor([[0.0, 0.0], [0.0, 3.0]])
     # Squared distances 1 and 4, halved and added.
-    assert float(centre_loss(features, own, "sum")) == pytest.approx(2.5)
-    assert float(centre_loss(features, own, "mean")) == pytest.approx(1.25)
+    assert float(center_loss(features, own, "sum")) == pytest.approx(2.5)
+    assert float(center_loss(features, own, "mean")) == pytest.approx(1.25)
 
 
-def test_centres_move_as_in_a_sequential_loop_over_eqn_4():
+def test_centers_move_as_in_a_sequential_loop_over_eqn_4():
     rng = np.random.default_rng(0)
-    centres, counts = rng.standard_normal((4, 3)), np.array([100, 7, 100, 1])
+    centers, counts = rng.standard_normal((4, 3)), np.array([100, 7, 100, 1])
     features, labels = rng.standard_normal((50, 3)), rng.integers(0, 3, 50)
 
-    moved, new_counts = moved_centres(*(torch.from_numpy(a) for a in (centres, counts, features, labels)))
+    moved, new_counts = moved_centers(*(torch.from_numpy(a) for a in (centers, counts, features, labels)))
 
-    expected, expected_counts = centres.copy(), counts.copy()
+    expected, expected_counts = centers.copy(), counts.copy()
     for f, k in zip(features, labels, strict=True):
         expected_counts[k] += 1
         expected[k] = (1 - 1 / expected_counts[k]) * expected[k] + f / expected_counts[k]
     np.testing.assert_allclose(moved.numpy(), expected, rtol=1e-12)
     np.testing.assert_array_equal(new_counts.numpy(), expected_counts)
-    np.testing.assert_array_equal(moved[3].numpy(), centres[3])  # no members, no change
+    np.testing.assert_array_equal(moved[3].numpy(), centers[3])  # no members, no change
 
 
 def test_three_dynamics_are_told_apart_with_five_clusters():
@@ -108,7 +109,7 @@ def test_three_dynamics_are_told_apart_with_five_clusters():
     assert (owner[found.labels] == new.sources).mean() > 0.9
 
 
-def test_a_model_without_training_data_for_a_centre_leaves_that_cluster_empty():
+def test_a_model_without_training_data_for_a_center_leaves_that_cluster_empty():
     demonstrations = three_dynamics((3, 3, 3))
     model = ContrastiveClustering(demonstrations, ClusteringConfig(**SMALL, num_clusters=3), 0).model()
     features = model.label(demonstrations, draws=1, root_seed=0).features
@@ -136,28 +137,28 @@ def test_diagnostics_by_hand():
 
 
 @pytest.mark.parametrize("reduction", ["sum", "mean"])
-@pytest.mark.parametrize("centres", ["trajectories", "kmeans"])
-@pytest.mark.parametrize("order", ["step_first", "centres_first"])
-def test_every_reading_of_the_method_trains(reduction, centres, order):
-    config = ClusteringConfig(**SMALL, num_clusters=3, reduction=reduction, initial_centres=centres, update_order=order)
+@pytest.mark.parametrize("centers", ["trajectories", "kmeans"])
+@pytest.mark.parametrize("order", ["step_first", "centers_first"])
+def test_every_reading_of_the_method_trains(reduction, centers, order):
+    config = ClusteringConfig(**SMALL, num_clusters=3, reduction=reduction, initial_centers=centers, update_order=order)
     clustering = ContrastiveClustering(three_dynamics((4, 4, 4)), config, 0)
     first = clustering.update()
     while clustering.iteration < config.warmup_iterations:
-        assert not clustering.counts.sub(100).any()  # centres rest while the encoder warms up
+        assert not clustering.counts.sub(100).any()  # centers rest while the encoder warms up
         last = clustering.update()
     assert last["contrastive_loss"] < first["contrastive_loss"]
     clustering.update()
     assert int(clustering.counts.sum()) == 3 * 100 + 2 * 12  # both views of all 12 demonstrations: fewer than a batch
-    torch.testing.assert_close(clustering.centres.norm(dim=1), torch.ones(3))
+    torch.testing.assert_close(clustering.centers.norm(dim=1), torch.ones(3))
 
 
-def test_the_official_preset_trains_without_normalised_centres():
+def test_the_official_preset_trains_without_normalized_centers():
     config = ClusteringConfig.model_validate({"preset": "official", **SMALL, "subtrajectory_length": 7})
     clustering = ContrastiveClustering(three_dynamics((6, 6, 6)), config, 0)
     while clustering.iteration < clustering.num_iterations:
         clustering.update()
     assert clustering.model().sampling.stride == 7
-    assert (clustering.centres.norm(dim=1) < 1).all()  # means of unit vectors that differ
+    assert (clustering.centers.norm(dim=1) < 1).all()  # means of unit vectors that differ
 
 
 def test_more_clusters_than_demonstrations_are_refused():
@@ -231,7 +232,7 @@ def test_interrupted_and_resumed_equals_uninterrupted_to_the_bit(make_run):
     whole = STAGE.run_job(make_run("whole"), "clustering", Context())
 
     stopped = make_run("stopped")
-    for after in (10, 20, 25):  # in the warm-up, when the centres are placed, among the joint iterations
+    for after in (10, 20, 25):  # in the warm-up, when the centers are placed, among the joint iterations
         with pytest.raises(JobStoppedError):
             STAGE.run_job(stopped, "clustering", Context(stop_after=after))
     context = Context()
@@ -304,7 +305,7 @@ def leaning(counts: tuple[int, int, int], seed: int = 0) -> Demonstrations:
 def test_the_warm_up_is_left_out_where_clusters_are_stable_without_it(make, skipped):
     clustering = ContrastiveClustering(make((4, 50, 50)), ClusteringConfig(subtrajectory_length=10, num_clusters=3), 0)
     assert clustering.iteration == (200 if skipped else 0)
-    assert bool(clustering.centres.any()) == skipped
+    assert bool(clustering.centers.any()) == skipped
 
 
 def test_a_mode_with_few_members_keeps_a_cluster_of_its_own():

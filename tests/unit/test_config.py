@@ -9,8 +9,8 @@ import pytest
 import yaml
 from pydantic import BaseModel, ValidationError
 
-import pipeline.config
-from pipeline.config import (
+import oodil.pipeline.config
+from oodil.pipeline.config import (
     CLUSTERING_PRESETS,
     ClusteringConfig,
     ImitationConfig,
@@ -19,7 +19,8 @@ from pipeline.config import (
     TransferabilityConfig,
     TrpoConfig,
 )
-from pipeline.loading import ConfigError, load_config, parse_config
+from oodil.pipeline.errors import ConfigError
+from oodil.pipeline.loading import load_config, parse_config
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = sorted((ROOT / "configs").glob("*.yaml"))
@@ -58,7 +59,7 @@ def test_a_minimal_file_gets_the_defaults(write, tmp_path):
     config = load_config(write(values()))
     assert config.seed == 0
     assert config.clustering == ClusteringConfig()
-    assert config.imitation.gail.generator == TrpoConfig()
+    assert config.imitation.gail.policy_optimizer == TrpoConfig()
     assert config.demonstrations.sources[0].expert == tmp_path / "experts" / "heavy"
 
 
@@ -71,9 +72,9 @@ def test_overrides_reach_every_depth_and_are_typed(write):
     overrides = [
         "seed=7",
         "imitation.gail.policy_hidden=[32, 16]",
-        "imitation.gail.generator.kind=ppo",
-        "imitation.gail.generator.learning_rate=1e-3",
-        "transferability.gail.generator.max_kl=0.02",
+        "imitation.gail.policy_optimizer.kind=ppo",
+        "imitation.gail.policy_optimizer.learning_rate=1e-3",
+        "transferability.gail.policy_optimizer.max_kl=0.02",
         "clustering.num_clusters=1",
         "runtime.workers=0",
         "environment.dynamics.gravity=9.8",
@@ -82,8 +83,8 @@ def test_overrides_reach_every_depth_and_are_typed(write):
     config = load_config(write(values()), overrides)
     assert config.seed == 7
     assert config.imitation.gail.policy_hidden == (32, 16)
-    assert config.imitation.gail.generator == PpoConfig(learning_rate=1e-3)
-    assert config.transferability.gail.generator == TrpoConfig(max_kl=0.02)
+    assert config.imitation.gail.policy_optimizer == PpoConfig(learning_rate=1e-3)
+    assert config.transferability.gail.policy_optimizer == TrpoConfig(max_kl=0.02)
     assert (config.clustering.num_clusters, config.runtime.workers, config.name) == (1, 0, "a-b")
     assert config.environment.dynamics == {"gravity": 9.8}
 
@@ -119,8 +120,8 @@ def test_bad_overrides_are_refused(write, override, message):
             r"unknown key 'imitation\.gail\.gamma'; (did you mean|valid keys: .*discount)",
         ),
         (
-            {"imitation": {"gail": {"total_steps": 1, "generator": {"kind": "ppo", "clp": 0.1}}}},
-            r"unknown key 'imitation\.gail\.generator\.clp'; did you mean 'clip'",
+            {"imitation": {"gail": {"total_steps": 1, "policy_optimizer": {"kind": "ppo", "clp": 0.1}}}},
+            r"unknown key 'imitation\.gail\.policy_optimizer\.clp'; did you mean 'clip'",
         ),
         (
             {"demonstrations": {"sources": [SOURCE | {"cuont": 3}]}},
@@ -137,7 +138,10 @@ def test_bad_overrides_are_refused(write, override, message):
         ({"imitation": {"gail": {"total_steps": 9, "discount": 1.5}}}, "discount: .*less than or equal to 1, got 1.5"),
         ({"imitation": {"gail": {"total_steps": 9, "policy_hidden": []}}}, "policy_hidden: .*at least 1"),
         ({"imitation": {"gail": {"total_steps": 9, "initial_log_std": float("nan")}}}, "finite number, got nan"),
-        ({"imitation": {"gail": {"total_steps": 9, "generator": {"kind": "sac"}}}}, "generator: .*sac.*'trpo', 'ppo'"),
+        (
+            {"imitation": {"gail": {"total_steps": 9, "policy_optimizer": {"kind": "sac"}}}},
+            "policy_optimizer: .*sac.*'trpo', 'ppo'",
+        ),
         ({"environment": {"dynamics": {"gravity": "low"}}}, "environment.dynamics.gravity: .*number.*got 'low'"),
         ({"environment": {"dynamics": {"gravity": float("inf")}}}, "environment.dynamics.gravity: .*finite.*got inf"),
         ({"clustering": {"preset": "offical"}}, "clustering: preset is 'offical'; there are paper, official"),
@@ -211,7 +215,7 @@ def test_iterations_round_up():
 def test_every_field_is_explained():
     sections = [
         value
-        for name, value in vars(pipeline.config).items()
+        for name, value in vars(oodil.pipeline.config).items()
         if isinstance(value, type) and issubclass(value, BaseModel) and name.endswith("Config")
     ]
     assert len(sections) > 10
@@ -227,7 +231,7 @@ def test_every_field_is_explained():
 def test_reading_a_configuration_loads_no_heavy_library():
     """``--help`` and a wrong key answer at once."""
     probe = (
-        "import sys, pipeline.config\n"
+        "import sys, oodil.pipeline.config\n"
         "heavy = {'torch', 'mujoco', 'gymnasium', 'sklearn', 'scipy', 'zmq', 'matplotlib'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.algorithms.contrastive import Encoder, Sampling, Subtrajectories, contrastive_loss, standardisation
-from pipeline.config import ClusteringConfig
-from pipeline.data import Demonstrations
+from oodil.pipeline.algorithms.contrastive import Encoder, Sampling, Subtrajectories, contrastive_loss, standardization
+from oodil.pipeline.config import ClusteringConfig
+from oodil.pipeline.data import Demonstrations
 
 
 def counting(lengths: list[int]) -> Demonstrations:
@@ -84,13 +84,13 @@ def test_every_phase_is_drawn_the_last_one_included():
     assert set(drawn[-1, :, 1]) == {8.0, 9.0}
 
 
-def test_standardised_states_have_mean_0_and_deviation_1_and_constants_become_0():
+def test_standardized_states_have_mean_0_and_deviation_1_and_constants_become_0():
     rng = np.random.default_rng(0)
     states = np.stack((1000 + 3 * rng.standard_normal(5000), np.full(5000, 7.3)), axis=1).astype(np.float32)
-    mean, scale = standardisation(states)
-    standardised = (states - mean) * scale
-    np.testing.assert_allclose(standardised.mean(axis=0), 0, atol=1e-4)
-    np.testing.assert_allclose(standardised.std(axis=0), [1, 0], atol=1e-4)
+    mean, scale = standardization(states)
+    standardized = (states - mean) * scale
+    np.testing.assert_allclose(standardized.mean(axis=0), 0, atol=1e-4)
+    np.testing.assert_allclose(standardized.std(axis=0), [1, 0], atol=1e-4)
 
 
 def unit_features(pairs: int, width: int = 16) -> torch.Tensor:

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.data import DataError, Demonstrations
-from pipeline.datasets import decode_demonstrations, encode_demonstrations
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.datasets import decode_demonstrations, encode_demonstrations
+from oodil.pipeline.errors import DataError
 
 
 def make(lengths=(3, 2, 4), **changes):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.algorithms.discriminator import Discriminator, discriminator_loss, imitation_reward
-from pipeline.config import DiscriminatorConfig
+from oodil.pipeline.algorithms.discriminator import Discriminator, discriminator_loss, imitation_reward
+from oodil.pipeline.config import DiscriminatorConfig
 
 
 @pytest.fixture

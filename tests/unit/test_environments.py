@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from pipeline.environments import make_batch
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.errors import OodilError
 
 HOPPER, WALKER, CHEETAH = "oodil/Hopper-v0", "oodil/Walker2d-v0", "oodil/HalfCheetah-v0"
 FOREVER = {"terminate_when_unhealthy": False}
@@ -185,7 +186,7 @@ def test_a_snapshot_of_another_model_is_refused():
         make_batch(HOPPER, {}, 3).restore(make_batch(WALKER, {}, 3).snapshot())
 
 
-def test_a_simulator_does_not_depend_on_its_neighbours():
+def test_a_simulator_does_not_depend_on_its_neighbors():
     one, two = make_batch(HOPPER, {}, 2), make_batch(HOPPER, {}, 2)
     rng = np.random.default_rng(0)
     for batch, seed in ((one, 1), (two, 2)):
@@ -272,7 +273,7 @@ def test_one_environments_dynamics_do_not_leak_into_another():
     ],
 )
 def test_bad_environments_are_refused(env_id, dynamics, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(OodilError, match=message):
         make_batch(env_id, dynamics, 1)
 
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
-from pipeline.algorithms.discriminator import imitation_reward
-from pipeline.algorithms.gail import AdversarialReward
-from pipeline.config import DiscriminatorConfig
+from oodil.pipeline.algorithms.discriminator import imitation_reward
+from oodil.pipeline.algorithms.gail import AdversarialReward
+from oodil.pipeline.config import DiscriminatorConfig
 
 
 def build(demonstrations, weights, **settings):

@@ -8,12 +8,13 @@ import pytest
 import safetensors.numpy
 import torch
 
-from pipeline.algorithms.gail import AdversarialReward
-from pipeline.algorithms.learner import EnvReward, Learner
-from pipeline.artifacts import encode_arrays
-from pipeline.config import DiscriminatorConfig, GailConfig, PpoConfig, TrainingConfig, TrpoConfig, ValueConfig
-from pipeline.rollout import Unit, collect
-from pipeline.seeding import derive_key
+from oodil.pipeline.algorithms.gail import AdversarialReward
+from oodil.pipeline.algorithms.learner import EnvReward, Learner
+from oodil.pipeline.artifacts import encode_arrays
+from oodil.pipeline.collecting import collect
+from oodil.pipeline.config import DiscriminatorConfig, GailConfig, PpoConfig, TrainingConfig, TrpoConfig, ValueConfig
+from oodil.pipeline.data import Unit
+from oodil.pipeline.seeding import derive_key
 
 TRPO, PPO = TrpoConfig(), PpoConfig(minibatch_size=40, epochs=2, learning_rate=1e-3)
 
@@ -38,7 +39,7 @@ def train(learner, first, last, snapshots=(None, None), dynamics=()):
     """Run iterations [first, last) as a job does, without lag; return the snapshots of the groups."""
     snapshots = list(snapshots)
     for iteration in range(first, last):
-        policy = learner.behaviour_policy()
+        policy = learner.behavior_policy()
         results = [
             collect(
                 Unit(
@@ -73,14 +74,14 @@ def shown(demonstrations):
 
 
 @pytest.mark.parametrize("imitate", [False, True], ids=["env_reward", "gail"])
-@pytest.mark.parametrize("normalise", [False, True], ids=["raw", "normalised"])
-@pytest.mark.parametrize("generator", [TRPO, PPO], ids=["trpo", "ppo"])
-def test_interrupted_equals_uninterrupted(shown, assert_same_bits, generator, normalise, imitate):
+@pytest.mark.parametrize("normalize", [False, True], ids=["raw", "normalized"])
+@pytest.mark.parametrize("policy_optimizer", [TRPO, PPO], ids=["trpo", "ppo"])
+def test_interrupted_equals_uninterrupted(shown, assert_same_bits, policy_optimizer, normalize, imitate):
     settings = {
         "demonstrations": shown if imitate else None,
-        "generator": generator,
-        "normalise_observations": normalise,
-        "scale_rewards": normalise,
+        "policy_optimizer": policy_optimizer,
+        "normalize_observations": normalize,
+        "scale_rewards": normalize,
         "initial_log_std": -0.5,
     }
     whole = build(**settings)
@@ -93,13 +94,13 @@ def test_interrupted_equals_uninterrupted(shown, assert_same_bits, generator, no
     resumed.load_state(saved)
     train(resumed, 2, 4, snapshots)
     assert_same_bits(resumed.state(), whole.state())
-    assert_same_bits(resumed.behaviour_policy(), whole.behaviour_policy())
+    assert_same_bits(resumed.behavior_policy(), whole.behavior_policy())
     assert any(not torch.equal(value, saved[name]) for name, value in whole.state().items())
 
 
-@pytest.mark.parametrize("generator", [TRPO, PPO], ids=["trpo", "ppo"])
-def test_a_fresh_state_can_be_saved_and_loaded(shown, assert_same_bits, generator):
-    one, two = (build(shown, generator=generator) for _ in range(2))
+@pytest.mark.parametrize("policy_optimizer", [TRPO, PPO], ids=["trpo", "ppo"])
+def test_a_fresh_state_can_be_saved_and_loaded(shown, assert_same_bits, policy_optimizer):
+    one, two = (build(shown, policy_optimizer=policy_optimizer) for _ in range(2))
     two.load_state(through_a_file(one.state()))
     train(one, 0, 1)
     train(two, 0, 1)
@@ -108,19 +109,19 @@ def test_a_fresh_state_can_be_saved_and_loaded(shown, assert_same_bits, generato
 
 def test_every_tensor_of_the_state_is_needed_and_restored(shown, assert_same_bits):
     """No entry is forgotten: a state of other numbers comes back as it is."""
-    learner = build(shown, generator=PPO, normalise_observations=True)
+    learner = build(shown, policy_optimizer=PPO, normalize_observations=True)
     train(learner, 0, 2)
     other = {name: torch.full_like(value, 0.5) for name, value in learner.state().items()}
     learner.load_state(through_a_file(other))
     assert_same_bits(dict(learner.state()), other)
     parts = {name.split("/")[0] for name in other}
-    assert parts == {"moments", "generator", "value_optimiser", "reward_model", "policy", "value"}
+    assert parts == {"moments", "policy_optimizer", "value_optimizer", "reward_model", "policy", "value"}
 
 
-@pytest.mark.parametrize("generator", [TRPO, PPO], ids=["trpo", "ppo"])
-def test_imitation_without_a_true_reward_gives_the_same_bits(shown, assert_same_bits, generator):
+@pytest.mark.parametrize("policy_optimizer", [TRPO, PPO], ids=["trpo", "ppo"])
+def test_imitation_without_a_true_reward_gives_the_same_bits(shown, assert_same_bits, policy_optimizer):
     """The fifth invariant, in an environment that really pays NaN."""
-    plain, poisoned = (build(shown, generator=generator) for _ in range(2))
+    plain, poisoned = (build(shown, policy_optimizer=policy_optimizer) for _ in range(2))
     train(plain, 0, 3)
     train(poisoned, 0, 3, dynamics=(("forward_reward_weight", math.nan),))
     assert_same_bits(poisoned.state(), plain.state())
@@ -162,23 +163,23 @@ def test_values_of_next_states(shown, rollout):
         successors = r.next_observations.copy()
         successors[:-1][~ended[:-1]] = r.observations[1:][~ended[:-1]]
         rollouts.append(replace(r, next_observations=successors))
-    learner = build(shown, normalise_observations=True)
+    learner = build(shown, normalize_observations=True)
     flat = torch.from_numpy(np.concatenate([r.observations for r in rollouts], axis=1)).flatten(0, 1)
     learner._track(flat)
     ended = np.concatenate([r.terminated | r.truncated for r in rollouts], axis=1)
-    values, next_values = learner._values(learner.policy.normalise(flat), rollouts, ended)
+    values, next_values = learner._values(learner.policy.normalize(flat), rollouts, ended)
     successors = torch.from_numpy(np.concatenate([r.next_observations for r in rollouts], axis=1))
     with torch.no_grad():
-        expected = learner.value(learner.policy.normalise(successors.flatten(0, 1))).view(8, 6).numpy()
-        present = learner.value(learner.policy.normalise(flat)).view(8, 6).numpy()
+        expected = learner.value(learner.policy.normalize(successors.flatten(0, 1))).view(8, 6).numpy()
+        present = learner.value(learner.policy.normalize(flat)).view(8, 6).numpy()
     np.testing.assert_allclose(next_values, expected, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(values, present, rtol=1e-5, atol=1e-6)
 
 
-def test_normaliser_is_the_mean_and_deviation_of_all_observations(shown):
+def test_normalizer_is_the_mean_and_deviation_of_all_observations(shown):
     rng = np.random.default_rng(0)
     parts = [torch.from_numpy(rng.normal(3.0, 2.0, (50, 12)).astype(np.float32)) for _ in range(3)]
-    learner = build(shown, normalise_observations=True)
+    learner = build(shown, normalize_observations=True)
     for part in parts:
         learner._track(part)
     together = torch.cat(parts).double().numpy()
@@ -186,7 +187,7 @@ def test_normaliser_is_the_mean_and_deviation_of_all_observations(shown):
     np.testing.assert_allclose(learner.policy.input_scale.numpy(), 1 / together.std(axis=0), rtol=1e-5)
 
 
-def test_imitators_are_normalised_by_the_demonstrations_as_they_are_weighted(demonstrations):
+def test_imitators_are_normalized_by_the_demonstrations_as_they_are_weighted(demonstrations):
     both = demonstrations(4, 2)
     reward = AdversarialReward(both, np.array([1.0, 3.0]), DiscriminatorConfig(hidden=(8,)), 0)
     learner = Learner(3, 2, TrainingConfig(total_steps=100, policy_hidden=(8,)), reward, 0)
@@ -196,21 +197,21 @@ def test_imitators_are_normalised_by_the_demonstrations_as_they_are_weighted(dem
 
 
 def test_a_constant_observation_does_not_blow_up(shown):
-    learner = build(shown, normalise_observations=True)
+    learner = build(shown, normalize_observations=True)
     learner._track(torch.full((50, 12), 3.0))
-    assert torch.isfinite(learner.policy.normalise(torch.full((1, 12), 3.5))).all()
+    assert torch.isfinite(learner.policy.normalize(torch.full((1, 12), 3.5))).all()
 
 
-def test_without_normalisation_the_policy_sees_raw_observations(shown):
-    learner = build(shown, normalise_observations=False)
+def test_without_normalization_the_policy_sees_raw_observations(shown):
+    learner = build(shown, normalize_observations=False)
     train(learner, 0, 1)
     assert not learner.policy.input_mean.any()
     assert (learner.policy.input_scale == 1).all()
 
 
 def test_sent_policies_do_not_follow_the_learner(shown):
-    learner = build(shown, normalise_observations=True)
-    sent = learner.behaviour_policy()
+    learner = build(shown, normalize_observations=True)
+    sent = learner.behavior_policy()
     before = {name: value.copy() for name, value in sent.arrays().items()}
     train(learner, 0, 1)
     for name, value in sent.arrays().items():

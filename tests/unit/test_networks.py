@@ -6,7 +6,7 @@ import torch
 from torch.distributions import Independent, Normal
 from torch.func import jvp
 
-from pipeline.algorithms.networks import MLP, PolicyNetwork
+from oodil.pipeline.algorithms.networks import MLP, PolicyNetwork
 
 
 class NumpyTanh(torch.autograd.Function):
@@ -54,7 +54,7 @@ def test_output_and_gradients_have_the_bits_of_autograd(plain_mlp, batch, inputs
 def test_a_policys_gradients_are_those_of_autograd(plain_mlp, network, batch):
     policy = network().double()
     observations, actions, _, _ = batch(policy, 50)
-    inputs, (log_std, *parameters) = policy.normalise(observations), policy.parameters()
+    inputs, (log_std, *parameters) = policy.normalize(observations), policy.parameters()
     expected = torch.autograd.grad(
         policy.log_prob(plain_mlp(parameters, inputs), actions).square().mean(), [log_std, *parameters]
     )

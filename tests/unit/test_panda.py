@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from pipeline.data import Episode
-from pipeline.environments import make_batch
-from pipeline.environments.panda import ALL_JOINTS, Arm, judge, start_angles
-from pipeline.evaluation import run_episodes
-from pipeline.experts import hand_written
-from pipeline.seeding import generator
+from oodil.pipeline.data import Episode
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.environments.panda import ALL_JOINTS, Arm, judge, start_angles
+from oodil.pipeline.errors import OodilError
+from oodil.pipeline.evaluation import run_episodes
+from oodil.pipeline.experts import hand_written
+from oodil.pipeline.seeding import numpy_rng
 
 ID, SLOW_ID = "oodil/Panda-v0", "oodil/Panda20Hz-v0"
 ARMS = {"whole": (), "1": (1,), "3": (3,), "4": (4,), "6": (6,), "1, 3": (1, 3), "1, 3, 4": (1, 3, 4)}
@@ -26,7 +27,7 @@ def dynamics(locked: tuple[int, ...], spread: float = 0.2) -> dict[str, float]:
 @lru_cache
 def demonstrated(locked: tuple[int, ...], env_id: str = ID) -> list[Episode]:
     arms = make_batch(env_id, dynamics(locked), 6)
-    return run_episodes(arms, hand_written(arms, env_id), generator((0,)), stochastic=False)
+    return run_episodes(arms, hand_written(arms, env_id), numpy_rng((0,)), stochastic=False)
 
 
 @pytest.mark.parametrize("env_id", [ID, SLOW_ID])
@@ -175,5 +176,5 @@ def test_rewards_and_ends(hand_x: float, box: tuple[float, ...], reward: float, 
     ],
 )
 def test_bad_dynamics_are_refused(wrong: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(OodilError, match=message):
         make_batch(ID, wrong, 1)

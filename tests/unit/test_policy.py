@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.distributions import Independent, Normal
 
-from pipeline.policy import GaussianPolicy
+from oodil.pipeline.policy import GaussianPolicy
 
 
 @pytest.fixture

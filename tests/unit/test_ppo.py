@@ -6,9 +6,9 @@ import gymnasium
 import pytest
 import torch
 
-import pipeline.environments  # noqa: F401  (registers the ids)
-from pipeline.algorithms.ppo import Ppo, clipped_surrogate
-from pipeline.config import PpoConfig
+import oodil.pipeline.environments  # noqa: F401  (registers the ids)
+from oodil.pipeline.algorithms.ppo import Ppo, clipped_surrogate
+from oodil.pipeline.config import PpoConfig
 
 
 def improve(policy, config, observations, actions, log_probs, advantages, step_scale=1.0):
@@ -64,7 +64,7 @@ def test_update_equals_stable_baselines3(network, batch, epochs, entropy_bonus):
     )
     peer.set_logger(Logger(None, []))
     ours = network(observation_dim=12, action_dim=3, hidden=(16, 16))
-    ours.input_mean.zero_()  # sb3 has no input normaliser
+    ours.input_mean.zero_()  # sb3 has no input normalizer
     ours.input_scale.fill_(1.0)
     extractor = peer.policy.mlp_extractor.policy_net
     theirs = (extractor[0], extractor[2], peer.policy.action_net)
@@ -104,7 +104,7 @@ def test_every_epoch_sees_every_sample_once(network, batch, monkeypatch):
         seen.append(advantages.clone())
         return clipped_surrogate(new, old, advantages, clip)
 
-    monkeypatch.setattr("pipeline.algorithms.ppo.clipped_surrogate", spy)
+    monkeypatch.setattr("oodil.pipeline.algorithms.ppo.clipped_surrogate", spy)
     improve(policy, PpoConfig(epochs=2, minibatch_size=16), observations, actions, log_probs, marks)
     assert [len(part) for part in seen] == [16, 16, 16, 2] * 2
     first, second = torch.cat(seen[:4]), torch.cat(seen[4:])

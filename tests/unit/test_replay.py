@@ -6,8 +6,9 @@ import gymnasium
 import numpy as np
 import pytest
 
-from pipeline.environments import check_environment, make_batch
-from pipeline.environments.replay import ReplayBatch
+from oodil.pipeline.environments import check_environment, make_batch
+from oodil.pipeline.environments.replay import ReplayBatch
+from oodil.pipeline.errors import OodilError
 
 PENDULUM, CAR = "Pendulum-v1", "MountainCarContinuous-v0"
 COUNT = 3
@@ -110,9 +111,9 @@ class Random(gymnasium.Env[np.ndarray, np.ndarray]):
 def test_what_cannot_be_repeated_or_never_ends_is_refused() -> None:
     gymnasium.register("test/Random-v0", entry_point=Random, max_episode_steps=50)
     gymnasium.register("test/Endless-v0", entry_point=Random)
-    with pytest.raises(ValueError, match=r"test/Random-v0.*not deterministic.*state at step 1"):
+    with pytest.raises(OodilError, match=r"test/Random-v0.*not deterministic.*state at step 1"):
         check_environment("test/Random-v0", {})
-    with pytest.raises(ValueError, match=r"test/Endless-v0.*no time limit"):
+    with pytest.raises(OodilError, match=r"test/Endless-v0.*no time limit"):
         check_environment("test/Endless-v0", {})
     assert isinstance(check_environment(PENDULUM, {"g": 5.0}), ReplayBatch)
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.artifacts import Artifact, RunDirectory, encode_arrays, encode_json, write_artifact
-from pipeline.loading import parse_config
-from pipeline.report import write_report
-from pipeline.report.collection import Collection, Source
-from pipeline.report.figures import source_looks
-from pipeline.results import Results, summary
-from pipeline.stage import Run
+from oodil.pipeline.artifacts import Artifact, RunDirectory, encode_arrays, encode_json, write_artifact
+from oodil.pipeline.loading import parse_config
+from oodil.pipeline.report import write_report
+from oodil.pipeline.report.collection import Collection, Source
+from oodil.pipeline.report.figures import source_looks
+from oodil.pipeline.results import Results, summary
+from oodil.pipeline.stage import Run
 
 VERSIONS = {"numpy": "2.4.1", "torch": "2.13.0", "mujoco": "3.9.0"}
 PAPER = {"gravity 15.0": True, "gravity 9.8": True, "gravity 2.0": False, "gravity 1.0": False}
@@ -91,10 +91,10 @@ class Writer:
 
     def clustering(self) -> None:
         """Blobs on the unit sphere, one per cluster, with a few strays."""
-        centres = self.rng.normal(size=(self.num_clusters, 128))
+        centers = self.rng.normal(size=(self.num_clusters, 128))
         own = np.random.default_rng(1).normal(size=(int(self.sources.max()) + 1, 128))
         features = (
-            centres[self.labels] + 0.5 * own[self.sources] + 0.75 * self.rng.normal(size=(len(self.sources), 128))
+            centers[self.labels] + 0.5 * own[self.sources] + 0.75 * self.rng.normal(size=(len(self.sources), 128))
         )
         features /= np.linalg.norm(features, axis=1, keepdims=True)
         sizes = np.bincount(self.labels, minlength=self.num_clusters)
@@ -287,7 +287,7 @@ def test_report_has_every_figure_and_the_source_of_its_numbers(full: tuple[Run, 
     for stage in ("demonstrations", "clustering", "transferability", "imitation", "naive_gail", "oracle"):
         assert run.artifact(stage).sha256 in page.text
     assert "torch 2.13.0" in page.text
-    assert "centre_weight: 0.01" in page.text  # of the resolved configuration
+    assert "center_weight: 0.01" in page.text  # of the resolved configuration
 
 
 def test_summary_takes_the_figures_as_written(full: tuple[Run, Page]) -> None:
@@ -419,7 +419,7 @@ def test_weak_evaluations_are_called_weak(tmp_path: Path) -> None:
     assert "imitation 5 M, naive GAIL 1 M, oracle 5 M environment steps" in text
 
 
-def test_scores_that_favour_the_wrong_sources_are_called_out(tmp_path: Path, full: tuple[Run, Page]) -> None:
+def test_scores_that_favor_the_wrong_sources_are_called_out(tmp_path: Path, full: tuple[Run, Page]) -> None:
     told = "Weighting did not raise the transferable share"
     assert told not in full[1].text
     run = full_run(tmp_path, **SMALL)
@@ -441,7 +441,7 @@ def test_shares_of_the_sampling_mass_count_transitions() -> None:
 
 def test_no_two_sources_look_alike() -> None:
     for transferable in ([None] * 30, [i % 3 == 0 for i in range(30)], [True, False, None] * 10):
-        assert len({(look.colour, look.marker) for look in source_looks(transferable)}) == 30
+        assert len({(look.color, look.marker) for look in source_looks(transferable)}) == 30
     same, other = source_looks([True, False])
     assert source_looks([False, True]) == [other, same]
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-import pipeline.rollout
-from pipeline.rollout import Unit, collect
-from pipeline.seeding import derive_key, generator
+import oodil.pipeline.collecting
+from oodil.pipeline.collecting import collect
+from oodil.pipeline.data import Unit
+from oodil.pipeline.seeding import derive_key, numpy_rng
 
 HOPPER, CHEETAH = "oodil/Hopper-v0", "oodil/HalfCheetah-v0"
 
@@ -39,7 +40,7 @@ def test_nothing_collected_before_matters(unit, network, assert_same_bits):
     collect(replace(unit, key=(9,), dynamics=(("gravity", 3.0),)))
     collect(replace(unit, key=(9,), policy=network(12, 3, seed=4).export()))
     assert_same_bits(collect(following(unit, first)), second)
-    pipeline.rollout._simulators.cache_clear()  # as in a worker that has just started
+    oodil.pipeline.collecting._simulators.cache_clear()  # as in a worker that has just started
     assert_same_bits(collect(following(unit, first)), second)
     assert_same_bits(collect(unit), first)
 
@@ -102,7 +103,7 @@ def test_a_rollout_replayed_in_gymnasium(unit):
     """Every recorded step is what a Gymnasium environment does with the recorded action."""
     result = collect(unit).rollout
     env = gymnasium.make(HOPPER, gravity=12.0)
-    rng = generator(unit.key)
+    rng = numpy_rng(unit.key)
     rng.standard_normal((60, 3, 3), dtype=np.float32)  # the noise is drawn first
     seeds = [int(rng.integers(2**31)) for _ in range(3)]
     current = env.reset(seed=seeds[0])[0]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.seeding import derive_key, generator, torch_seed
+from oodil.pipeline.seeding import derive_key, numpy_rng, torch_seed
 
 NAMES = [
     (0, "rollout", 0, 0),
@@ -16,7 +16,7 @@ NAMES = [
 
 def test_equal_keys_give_equal_streams():
     for root, *path in NAMES:
-        one, two = (generator(derive_key(root, *path)).random(4) for _ in range(2))
+        one, two = (numpy_rng(derive_key(root, *path)).random(4) for _ in range(2))
         np.testing.assert_array_equal(one, two)
         assert torch_seed(derive_key(root, *path)) == torch_seed(derive_key(root, *path))
 
@@ -24,14 +24,14 @@ def test_equal_keys_give_equal_streams():
 def test_different_keys_give_different_streams():
     keys = [derive_key(root, *path) for root, *path in NAMES]
     assert len(set(keys)) == len(keys)
-    draws = {generator(key).integers(2**62) for key in keys}
+    draws = {numpy_rng(key).integers(2**62) for key in keys}
     assert len(draws) == len(keys)
     assert len({torch_seed(key) for key in keys}) == len(keys)
 
 
 def test_a_trailing_zero_is_part_of_the_name():
     """NumPy pads short seeds with zeros, so (5, "x") and (5, "x", 0) would be one stream if the key were entropy."""
-    one, two = generator(derive_key(5, "x")), generator(derive_key(5, "x", 0))
+    one, two = numpy_rng(derive_key(5, "x")), numpy_rng(derive_key(5, "x", 0))
     assert one.random() != two.random()
 
 

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.algorithms.learner import EnvReward, Learner
-from pipeline.artifacts import Checkpoints
-from pipeline.config import EnvironmentConfig, TrainingConfig, ValueConfig
-from pipeline.rollout import InlineRollouts
-from pipeline.training import train
+from oodil.pipeline.algorithms.learner import EnvReward, Learner
+from oodil.pipeline.artifacts import Checkpoints
+from oodil.pipeline.collecting import InlineRollouts
+from oodil.pipeline.config import EnvironmentConfig, TrainingConfig, ValueConfig
+from oodil.pipeline.training import train
 
 
 class Context:

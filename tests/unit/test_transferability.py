@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.algorithms.discriminator import Discriminator, mean_logit_per_demonstration
-from pipeline.algorithms.transferability import (
+from oodil.pipeline.algorithms.discriminator import Discriminator, mean_logit_per_demonstration
+from oodil.pipeline.algorithms.weights import (
     sampling_mass,
     share_lasted,
     sharpened_weights,
     transferability,
 )
-from pipeline.config import DiscriminatorConfig
+from oodil.pipeline.config import DiscriminatorConfig
 
 
 def test_mean_logit_is_over_the_transitions_of_each_demonstration(demonstrations):

@@ -7,10 +7,10 @@ import torch
 from torch.distributions import Normal, kl_divergence
 from torch.func import hessian
 
-import pipeline.algorithms.trpo as trpo_module
-import pipeline.environments  # noqa: F401  (registers the ids)
-from pipeline.algorithms.trpo import Trpo, conjugate_gradient
-from pipeline.config import TrpoConfig
+import oodil.pipeline.algorithms.trpo as trpo_module
+import oodil.pipeline.environments  # noqa: F401  (registers the ids)
+from oodil.pipeline.algorithms.trpo import Trpo, conjugate_gradient
+from oodil.pipeline.config import TrpoConfig
 
 
 def improve(policy, config, observations, actions, log_probs, advantages, step_scale=1.0):
@@ -74,7 +74,7 @@ def test_fisher_product_is_the_second_derivative_of_the_divergence(network, batc
     def divergence(flat):
         parts = flat.split([shape.numel() for shape in shapes])
         log_std, *layers = (part.view(shape) for part, shape in zip(parts, shapes, strict=True))
-        new = Normal(plain_mlp(layers, policy.normalise(seen)), log_std.exp())
+        new = Normal(plain_mlp(layers, policy.normalize(seen)), log_std.exp())
         return kl_divergence(Normal(old_mean, old_std), new).sum(-1).mean()
 
     expected = hessian(divergence)(parameters_of(policy).clone())
@@ -106,7 +106,7 @@ def test_step_equals_stable_baselines3(network, batch):
     )
     peer.set_logger(Logger(None, []))
     ours = network(observation_dim=12, action_dim=3, hidden=(16, 16))
-    ours.input_mean.zero_()  # sb3 has no input normaliser
+    ours.input_mean.zero_()  # sb3 has no input normalizer
     ours.input_scale.fill_(1.0)
     theirs = (peer.policy.mlp_extractor.policy_net[0], peer.policy.mlp_extractor.policy_net[2], peer.policy.action_net)
     with torch.no_grad():
@@ -224,7 +224,7 @@ def test_broken_numbers_leave_the_policy_untouched(network, batch, broken, value
 
 
 def test_log_probabilities_of_an_older_policy_weigh_the_samples(network, batch):
-    """With lag 1 the ratio starts away from one: samples the old policy favoured count less."""
+    """With lag 1 the ratio starts away from one: samples the old policy favored count less."""
     policy = network()
     observations, actions, log_probs, advantages = batch(policy, 100)
     older = log_probs + 0.5 * torch.randn(100, generator=torch.Generator().manual_seed(5))

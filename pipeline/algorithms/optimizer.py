@@ -11,16 +11,16 @@ class Adam:
 
     def __init__(self, parameters: list[torch.nn.Parameter], learning_rate: float, weight_decay: float = 0.0) -> None:
         self._parameters = parameters
-        self._optimiser = torch.optim.Adam(parameters, lr=learning_rate, weight_decay=weight_decay, fused=True)
+        self._optimizer = torch.optim.Adam(parameters, lr=learning_rate, weight_decay=weight_decay, fused=True)
 
     @property
     def learning_rate(self) -> float:
         """The present step size."""
-        return float(self._optimiser.param_groups[0]["lr"])
+        return float(self._optimizer.param_groups[0]["lr"])
 
     @learning_rate.setter
     def learning_rate(self, value: float) -> None:
-        self._optimiser.param_groups[0]["lr"] = value
+        self._optimizer.param_groups[0]["lr"] = value
 
     def step(self, loss: Tensor) -> None:
         """Differentiate ``loss`` and take one step."""
@@ -32,18 +32,18 @@ class Adam:
             parameter.grad = gradient
         if max_grad_norm is not None:
             torch.nn.utils.clip_grad_norm_(self._parameters, max_grad_norm)
-        self._optimiser.step()
+        self._optimizer.step()
 
     def state(self) -> dict[str, Tensor]:
         """Return the moments and the step count of every parameter; empty before the first step."""
-        moments = self._optimiser.state_dict()["state"]
+        moments = self._optimizer.state_dict()["state"]
         return {f"{i}.{name}": value for i, entry in moments.items() for name, value in entry.items()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Continue from `state`."""
-        whole = self._optimiser.state_dict()
+        whole = self._optimizer.state_dict()
         whole["state"] = {}
         for name, value in state.items():
             index, field = name.split(".")
             whole["state"].setdefault(int(index), {})[field] = value.clone()
-        self._optimiser.load_state_dict(whole)
+        self._optimizer.load_state_dict(whole)

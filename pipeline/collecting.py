@@ -1,72 +1,18 @@
 """The pure function at the heart of the runtime: collect(unit) -> (rollout, end snapshot).
 
-Letters: T steps, G simulators of one env group, S observation, A action.
+Letters: T steps, G simulators of one env group, A action.
 """
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.environments import Simulators, Snapshot, make_batch
-from pipeline.policy import GaussianPolicy
-from pipeline.seeding import Key, generator
-
-
-@dataclass(frozen=True)
-class Unit:
-    """Everything that one rollout depends on."""
-
-    iteration: int
-    group: int
-    env_id: str
-    dynamics: tuple[tuple[str, float], ...]
-    num_simulators: int
-    num_steps: int
-    policy_version: int
-    policy: GaussianPolicy
-    key: Key
-    snapshot: Snapshot | None
-    """Where the group stands; None starts every simulator with a fresh episode."""
-
-
-@dataclass(frozen=True)
-class Rollout:
-    """Experience of one env group under exactly one policy version."""
-
-    policy_version: int
-    observations: NDArray[np.float32]
-    """(T, G, S)"""
-    next_observations: NDArray[np.float32]
-    """(T, G, S), before any reset."""
-    actions: NDArray[np.float32]
-    """(T, G, A)"""
-    log_probs: NDArray[np.float32]
-    """(T, G) under the policy that acted."""
-    terminated: NDArray[np.bool_]
-    """(T, G)"""
-    truncated: NDArray[np.bool_]
-    """(T, G)"""
-    env_rewards: NDArray[np.float64]
-    """(T, G); only experts learn from it."""
-    episode_returns: NDArray[np.float64]
-    """(E,) true returns of the episodes that ended; evaluation only."""
-    episode_lengths: NDArray[np.int64]
-    """(E,)"""
-
-
-@dataclass(frozen=True)
-class UnitResult:
-    """A unit's rollout and where its env group stands afterwards."""
-
-    iteration: int
-    group: int
-    rollout: Rollout
-    snapshot: Snapshot
-
+from oodil.pipeline.data import Rollout, Unit, UnitResult
+from oodil.pipeline.environments import Simulators, make_batch
+from oodil.pipeline.seeding import numpy_rng
 
 Follow = Callable[[UnitResult], list[Unit]]
 """What a result is followed by: its group's next unit, or nothing yet."""
@@ -75,6 +21,20 @@ Follow = Callable[[UnitResult], list[Unit]]
 def nothing_follows(result: UnitResult) -> list[Unit]:
     """Leave it to the caller of `gather` to submit what comes next."""
     return []
+
+
+class RolloutSource(Protocol):
+    """Who collects: the job's own process, rollout workers behind a socket, or a cluster. All give the same bits."""
+
+    def submit(self, units: list[Unit]) -> None:
+        """Hand over units; collection may begin at once."""
+
+    def gather(self, follow: Follow = nothing_follows) -> list[UnitResult]:
+        """Wait for the iteration that was submitted first and return its results in group order.
+
+        What ``follow`` makes of a result is submitted as soon as the result is there, so that nobody who collects
+        waits for the slowest group. It is called once for each result, in any order, on the caller's thread.
+        """
 
 
 @lru_cache(maxsize=32)
@@ -86,7 +46,7 @@ def _simulators(env_id: str, dynamics: tuple[tuple[str, float], ...], num_simula
 def collect(unit: Unit) -> UnitResult:
     """Run one env group for ``num_steps`` steps; the result depends on nothing but ``unit``."""
     simulators = _simulators(unit.env_id, unit.dynamics, unit.num_simulators, unit.group)
-    rng = generator(unit.key)
+    rng = numpy_rng(unit.key)
     shape = (unit.num_steps, unit.num_simulators)
     noise = rng.standard_normal((*shape, simulators.action_dim), dtype=np.float32)
     if unit.snapshot is None:

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import Files, RunDirectory
-from pipeline.config import RunConfig
-from pipeline.data import Demonstrations, Episode
-from pipeline.environments import make_batch
-from pipeline.stage import JobContext, Run, Stage
-from workers.engine import Event, JobFailed, JobProgress, LocalEngine
+from oodil.pipeline.artifacts import Files, RunDirectory
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.data import Demonstrations, Episode
+from oodil.pipeline.environments import make_batch
+from oodil.pipeline.stage import JobContext, Run, Stage
+from oodil.workers.engine import Event, JobFailed, JobProgress, LocalEngine
 
 WARM_UP = 0.3
 """Share of a learner's run that is not counted: processes start, and untrained robots fall all the time."""
@@ -55,7 +55,7 @@ def learner_rate(config: RunConfig, workers: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         run = Run(config, RunDirectory(Path(folder)))
         run.directory.config.write_text(config.model_dump_json())
-        engine = LocalEngine(workers, "bench:stage_named")
+        engine = LocalEngine(workers, "oodil.bench:stage_named")
         engine.run_jobs(LearnerLoop(), run, ["loop"], on_event, lambda: False)
     timed = [(at, event) for at, event in seen if event.done >= WARM_UP * event.total]
     (start, first), (end, last) = timed[0], timed[-1]
@@ -77,9 +77,9 @@ class LearnerLoop(Stage):
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Train and forget."""
-        from pipeline.algorithms.gail import AdversarialReward
-        from pipeline.algorithms.learner import Learner
-        from pipeline.training import train
+        from oodil.pipeline.algorithms.gail import AdversarialReward
+        from oodil.pipeline.algorithms.learner import Learner
+        from oodil.pipeline.training import train
 
         environment, gail = run.config.environment, run.config.imitation.gail
         demonstrations = random_demonstrations(environment.id)

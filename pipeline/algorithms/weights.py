@@ -6,7 +6,7 @@ Letters: N demonstrations, E scores taken while a job ran and at its end.
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Demonstrations
+from oodil.pipeline.data import Demonstrations
 
 Array = NDArray[np.float64]
 

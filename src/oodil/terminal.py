@@ -14,11 +14,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from pipeline.results import shown_return
-from workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, JobWarning, WorkerRestarted
+from oodil.pipeline.results import shown_return
+from oodil.workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, JobWarning, WorkerRestarted
 
 if TYPE_CHECKING:
-    from pipeline.data import Demonstrations
+    from oodil.pipeline.data import Demonstrations
 
 PLAIN_INTERVAL_S = 10.0
 """Seconds between lines about one job where there is no terminal."""

@@ -6,12 +6,12 @@ import time
 import traceback
 from pathlib import Path
 
-from pipeline.rollout import collect
-from pipeline.versions import collecting_versions
-from workers.channels import Dealer
-from workers.messages import Header, Ready, Refused, ResultMessage, UnitFailure, UnitMessage, decode, encode
-from workers.supervisor import Link
-from workers.wire import MessageError, shortened
+from oodil.pipeline.collecting import collect
+from oodil.pipeline.versions import collecting_versions
+from oodil.workers.channels import Dealer
+from oodil.workers.messages import Header, Ready, Refused, ResultMessage, UnitFailure, UnitMessage, decode, encode
+from oodil.workers.supervisor import Link
+from oodil.workers.wire import MessageError, shortened
 
 READY_INTERVAL_S = 1.0
 _POLL_S = 0.1

@@ -13,12 +13,13 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from pipeline.rollout import Follow, Unit, UnitResult, nothing_follows
-from pipeline.stage import JobStoppedError
-from pipeline.versions import collecting_versions
-from workers.channels import Access, Router
-from workers.messages import Header, Ready, Refused, ResultMessage, UnitFailure, UnitMessage, decode, encode
-from workers.wire import MessageError
+from oodil.pipeline.collecting import Follow, nothing_follows
+from oodil.pipeline.data import Unit, UnitResult
+from oodil.pipeline.stage import JobStoppedError
+from oodil.pipeline.versions import collecting_versions
+from oodil.workers.channels import Access, Router
+from oodil.workers.messages import Header, Ready, Refused, ResultMessage, UnitFailure, UnitMessage, decode, encode
+from oodil.workers.wire import MessageError
 
 UNITS_PER_WORKER = 2
 """One in work and one waiting, so that a worker never waits for the learner's answer."""

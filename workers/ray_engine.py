@@ -2,8 +2,8 @@
 
 Placing tasks, moving bytes and running again what was lost is Ray's. Ray does not see that a task hangs, so a task
 whose time is up ends its own process, and with that it is lost like any other. What travels are texts, numbers and the
-frames of `workers.messages`. The run's folder has to be on storage that every node sees under the same path, and every
-node has the same oodil installed.
+frames of `oodil.workers.messages`. The run's folder has to be on storage that every node sees under the same path, and
+every node has the same oodil installed.
 """
 
 import faulthandler
@@ -21,15 +21,16 @@ import ray
 from ray.util import get_node_ip_address
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from pipeline.loading import ConfigError
-from pipeline.rollout import Follow, InlineRollouts, Unit, UnitResult, collect, nothing_follows
-from pipeline.stage import JobStoppedError, Run, Stage
-from pipeline.versions import collecting_versions
-from workers import job as job_process
-from workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, JobWarning, OnEvent, Outcome
-from workers.messages import Header, ResultMessage, UnitMessage, decode, encode
-from workers.reports import Failed, Progress, Report, Warn, decode_report, encode_report
-from workers.wire import MessageError, shortened
+from oodil.pipeline.collecting import Follow, InlineRollouts, collect, nothing_follows
+from oodil.pipeline.data import Unit, UnitResult
+from oodil.pipeline.errors import ConfigError
+from oodil.pipeline.stage import JobStoppedError, Run, Stage
+from oodil.pipeline.versions import collecting_versions
+from oodil.workers import job as job_process
+from oodil.workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, JobWarning, OnEvent, Outcome
+from oodil.workers.messages import Header, ResultMessage, UnitMessage, decode, encode
+from oodil.workers.reports import Failed, Progress, Report, Warn, decode_report, encode_report
+from oodil.workers.wire import MessageError, shortened
 
 _POLL_S = 0.2
 _LOST = "its process or its node is gone; Ray runs it again"
@@ -41,7 +42,7 @@ _ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS",
 def connect(trusted: bool) -> None:
     """Join the Ray cluster at RAY_ADDRESS or on this machine, or start one here if there is none.
 
-    Raises ValueError for a cluster of several machines without token authentication, unless it is ``trusted``: whoever
+    Raises ConfigError for a cluster of several machines without token authentication, unless it is ``trusted``: whoever
     reaches its ports can run programs on it.
     """
     authenticated = os.environ.get("RAY_AUTH_MODE") == "token"
@@ -50,7 +51,7 @@ def connect(trusted: bool) -> None:
     addresses = {node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]}
     try:
         _refuse_unless(trusted or authenticated or addresses == {get_node_ip_address()})
-    except ValueError:
+    except ConfigError:
         ray.shutdown()
         raise
 
@@ -67,7 +68,7 @@ def _is_here(address: str) -> bool:
 
 def _refuse_unless(acceptable: bool) -> None:
     if not acceptable:
-        raise ValueError(
+        raise ConfigError(
             "this Ray cluster spans machines and asks nobody for a token: start it with RAY_AUTH_MODE=token and set "
             "that here too, or say --trust-cluster where its network is closed"
         )
@@ -76,7 +77,7 @@ def _refuse_unless(acceptable: bool) -> None:
 class RayEngine:
     """Runs jobs as Ray tasks; a distributed stage's job has its units collected by Ray tasks, too."""
 
-    def __init__(self, stages: str = "pipeline.stages:stage_named") -> None:
+    def __init__(self, stages: str = "oodil.pipeline.stages:stage_named") -> None:
         self._stages = stages
         """Where a task finds ``(config, name) -> Stage``, as module:function."""
 

@@ -1,0 +1,33 @@
+"""The one family of errors that a user can mend; whatever else is raised is a defect and keeps its traceback."""
+
+
+class OodilError(Exception):
+    """Input, files or machines that cannot be used; the message names the value and what is allowed."""
+
+
+class ConfigError(OodilError):
+    """A configuration that cannot be used; the message names the key, the value and what is allowed."""
+
+
+class DataError(OodilError):
+    """Demonstrations that cannot be used; the message names the demonstration, the value and the limit."""
+
+
+class ExpertError(OodilError):
+    """An expert that is missing, damaged, or does not fit; the message names its folder."""
+
+
+class UnusableEnvironmentError(OodilError):
+    """An environment that cannot be made, or that cannot be learned in; the message names its id."""
+
+
+class NotFinishedError(OodilError):
+    """Something was asked of a stage that is not finished, or whose artifact is stale."""
+
+
+class DamagedArtifactError(OodilError):
+    """A file of a finished artifact is missing or does not have the bytes that its manifest names."""
+
+
+class StorageError(OodilError):
+    """A folder or a disk that does not take what is to be written; the message names it."""

@@ -1,0 +1,1 @@
+"""Imitation learning from demonstrators whose dynamics differ from your own robot's."""

@@ -1,0 +1,402 @@
+"""The command line: ``oodil ...`` and ``python orchestrator.py ...`` are the same program.
+
+No mathematics and no sockets. Heavy imports follow argument parsing, so that ``--help`` answers at once.
+"""
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from oodil.pipeline.errors import ConfigError, OodilError
+
+if TYPE_CHECKING:
+    from oodil.pipeline.config import RunConfig
+    from oodil.pipeline.stage import Run, Stage
+    from oodil.workers.engine import Engine
+
+# Before NumPy and torch are loaded: one compute thread per process, so that the bits do not depend on the machine.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_variable] = "1"
+
+EXIT_FAILED, EXIT_BAD_INPUT, EXIT_STOPPED = 1, 2, 130
+
+app = typer.Typer(
+    name="oodil",
+    help="Imitation learning from demonstrators whose dynamics differ from your robot's.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+demos_app = typer.Typer(help="Inspect and collect demonstrations.", no_args_is_help=True)
+app.add_typer(demos_app, name="demos")
+keys_app = typer.Typer(help="Keys for rollout workers on other machines.", no_args_is_help=True)
+app.add_typer(keys_app, name="keys")
+
+ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="A YAML file; configs/ has examples.")]
+Overrides = Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Fields to override.")]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN_DIR", help="The folder of a run.")]
+Workers = Annotated[int | None, typer.Option("--workers", "-w", min=0, help="Parallel processes; 0 runs inline.")]
+Until = Annotated[str | None, typer.Option(help="Stop after this stage.")]
+Force = Annotated[str | None, typer.Option(help="Compute this stage again although it is finished.")]
+Bind = Annotated[str | None, typer.Option(help="Let workers of other machines join here, e.g. tcp://0.0.0.0:5555.")]
+Keys = Annotated[Path | None, typer.Option(help="Folder of keys, made by `oodil keys new`; --bind needs it.")]
+EngineName = Annotated[Literal["local", "ray"], typer.Option(help="This machine's processes, or a Ray cluster.")]
+TrustCluster = Annotated[bool, typer.Option("--trust-cluster", help="Use a Ray cluster that asks for no token.")]
+
+
+@app.command()
+def run(
+    config_path: ConfigPath,
+    overrides: Overrides = None,
+    workers: Workers = None,
+    run_dir: Annotated[Path | None, typer.Option(help="Default: runs/NAME-seedSEED.")] = None,
+    until: Until = None,
+    force: Force = None,
+    bind: Bind = None,
+    keys: Keys = None,
+    engine: EngineName = "local",
+    trust_cluster: TrustCluster = False,
+) -> None:
+    """Run the pipeline; what is already finished is reused, what was interrupted goes on."""
+    with _bad_input():
+        from oodil.pipeline.loading import load_config
+
+        config = load_config(config_path, overrides)
+        from oodil.orchestrator import check_inputs, open_run
+
+        check_inputs(config)
+        chosen = _engine(config, engine, workers, bind, keys, trust_cluster)
+        opened = open_run(run_dir or Path("runs") / f"{config.name}-seed{config.seed}", config)
+    _execute(opened, chosen, until, force)
+
+
+@app.command()
+def resume(
+    run_dir: RunPath,
+    workers: Workers = None,
+    until: Until = None,
+    force: Force = None,
+    bind: Bind = None,
+    keys: Keys = None,
+    engine: EngineName = "local",
+    trust_cluster: TrustCluster = False,
+) -> None:
+    """Go on with an interrupted run, with any number of workers or on another engine."""
+    from oodil.orchestrator import check_inputs, read_run
+
+    with _bad_input():
+        opened = read_run(run_dir)
+        check_inputs(opened.config)
+        chosen = _engine(opened.config, engine, workers, bind, keys, trust_cluster)
+    _execute(opened, chosen, until, force)
+
+
+@app.command()
+def worker(
+    connect: Annotated[str, typer.Option(help="Address of a run started with --bind, e.g. tcp://lab-server:5555.")],
+    keys: Annotated[Path, typer.Option(help="This machine's folder of keys, made beside the run by `oodil keys new`.")],
+    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 1,
+    logs: Annotated[Path, typer.Option(help="Folder for their logs.")] = Path("worker-logs"),
+) -> None:
+    """Collect rollouts for a run on another machine, until Ctrl-C; come and go as you like."""
+    from oodil.terminal import stop_flag
+    from oodil.workers.keys import client_keys
+    from oodil.workers.remote import WorkersError, serve
+
+    with _bad_input():
+        client_keys(keys)
+    with stop_flag(lambda: print("stopping")) as should_stop:
+        try:
+            serve(connect, keys, workers, logs, print, should_stop)
+        except WorkersError as error:
+            print(f"oodil: {error}", file=sys.stderr)
+            raise typer.Exit(EXIT_FAILED) from None
+
+
+@keys_app.command("new")
+def new_keys(
+    folder: Annotated[Path, typer.Argument(metavar="KEYS", help="The folder of the learner's keys.")],
+    worker: Annotated[str | None, typer.Option(help="Allow one more machine, and make its keys.")] = None,
+) -> None:
+    """Make the learner's keys, or with --worker those of a machine that may join."""
+    from oodil.workers.channels import new_key_pair
+    from oodil.workers.keys import create_learner_keys, create_worker_keys
+
+    with _bad_input():
+        if worker is None:
+            create_learner_keys(folder, new_key_pair)
+            print(f"{folder}: the learner's keys; allow a machine with: oodil keys new {folder} --worker NAME")
+        else:
+            own = create_worker_keys(folder, worker, new_key_pair)
+            print(f"{own}: copy this folder to the machine, by a way that nobody else can read, and remove it here")
+
+
+@app.command()
+def status(run_dir: RunPath, as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False) -> None:
+    """Say which stages are finished and what is known so far."""
+    from oodil.orchestrator import describe, read_run
+    from oodil.terminal import print_status
+
+    with _bad_input():
+        described = describe(read_run(run_dir))
+    if as_json:
+        print(json.dumps(described, indent=2))
+    else:
+        print_status(described)
+
+
+@app.command()
+def report(run_dir: RunPath) -> None:
+    """Write the report anew, of whatever is finished."""
+    from oodil.orchestrator import read_run
+    from oodil.pipeline.report import write_report
+
+    with _bad_input():
+        opened = read_run(run_dir)
+    print(write_report(opened))
+
+
+@app.command()
+def evaluate(
+    run_dir: RunPath,
+    episodes: Annotated[int, typer.Option(min=1, help="Deterministic episodes.")] = 32,
+    stage: Annotated[str, typer.Option(help="Whose policy: imitation, naive_gail or oracle.")] = "imitation",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the episodes.")] = 0,
+    video: Annotated[bool, typer.Option("--video", help="Also film one episode.")] = False,
+) -> None:
+    """Evaluate a trained policy on the true return of the imitator's environment."""
+    from oodil.orchestrator import read_run
+    from oodil.pipeline.evaluation import evaluate as evaluate_policy
+    from oodil.pipeline.evaluation import film
+    from oodil.pipeline.policy import GaussianPolicy
+    from oodil.pipeline.seeding import derive_key
+
+    with _bad_input():
+        opened = read_run(run_dir)
+        policy = GaussianPolicy.from_arrays(opened.artifact(stage).arrays("policy.safetensors"))
+    environment = opened.config.environment
+    seen = evaluate_policy(policy, environment.id, environment.dynamics, episodes, derive_key(seed, "evaluate"))
+    print(
+        f"{stage}: return {seen.returns.mean():.1f} ± {seen.returns.std():.1f}, "
+        f"length {seen.lengths.mean():.0f}, {episodes} deterministic episodes, seed {seed}"
+    )
+    if video:
+        path = opened.directory.path / f"{stage}.mp4"
+        with _bad_input():
+            env_return = film(policy, environment.id, environment.dynamics, seed, path)
+        print(f"{path}: one episode, return {env_return:.1f}")
+
+
+@app.command()
+def bench(
+    config_path: ConfigPath,
+    overrides: Overrides = None,
+    workers: Annotated[list[int] | None, typer.Option("--workers", "-w", min=0, help="Repeat for several.")] = None,
+) -> None:
+    """Find the number of workers with which the learner is fastest here; takes about a minute."""
+    from oodil.bench import compare, worker_counts
+    from oodil.orchestrator import check_inputs
+    from oodil.pipeline.loading import load_config
+    from oodil.terminal import print_bench
+
+    with _bad_input():
+        config = load_config(config_path, overrides)
+        check_inputs(config)
+
+    def show(count: int, figures: dict[str, float]) -> None:
+        print(f"{count} workers: {figures['steps_per_s']:,.0f} environment steps per second", file=sys.stderr)
+
+    print_bench(config.environment.id, compare(config, sorted(set(workers or worker_counts())), show))
+
+
+@demos_app.command("inspect")
+def inspect_demos(path: Annotated[Path, typer.Argument(help="A file of demonstrations, or a run's folder.")]) -> None:
+    """Show what a set of demonstrations contains."""
+    from oodil.orchestrator import read_run
+    from oodil.pipeline.datasets import read_demonstrations
+    from oodil.terminal import print_demonstrations
+
+    with _bad_input():
+        file = path
+        if path.is_dir():
+            file = read_run(path).artifact("demonstrations").path / "demonstrations.safetensors"
+        demonstrations, environment = read_demonstrations(file)
+    print_demonstrations(file, demonstrations, environment)
+
+
+@demos_app.command("collect")
+def collect_demos(
+    config_path: ConfigPath,
+    overrides: Overrides = None,
+    train: Annotated[bool, typer.Option("--train", help="First train the experts anew, and save them.")] = False,
+    output: Annotated[Path, typer.Option(help="The file to write.")] = Path("demonstrations.safetensors"),
+    workers: Workers = None,
+) -> None:
+    """Collect demonstrations from the experts of a configuration into one file; interrupted, it goes on."""
+    from oodil.orchestrator import check_inputs, open_run
+    from oodil.pipeline.loading import load_config
+    from oodil.pipeline.stages import stages
+    from oodil.pipeline.stages.experts import ExpertsStage
+
+    with _bad_input():
+        config = load_config(config_path, overrides)
+        if not train:
+            check_inputs(config)
+        engine = _engine(config, "local", workers)
+        opened = open_run(output.with_name(f".{output.name}.run"), config)
+    if train:
+        experts = ExpertsStage()
+        _walk(opened, [experts], engine, None)
+        print("\n".join(experts.export(opened)))
+    _walk(opened, stages(config)[:1], engine, None)
+    output.write_bytes(opened.artifact("demonstrations").read("demonstrations.safetensors"))
+    inspect_demos(output)
+
+
+@demos_app.command("convert")
+def convert_demos(
+    sources: Annotated[
+        list[str],
+        typer.Argument(help="FILE.npz, FILE.hdf5 (robomimic), FILE.pkl (released code) or minari:DATASET_ID."),
+    ],
+    environment: Annotated[str, typer.Option(help="Id of the imitator's environment, such as oodil/Hopper-v0.")],
+    output: Annotated[Path, typer.Option(help="The file to write.")] = Path("demonstrations.safetensors"),
+    keys: Annotated[
+        str, typer.Option(help="For observations with several entries: those that make up a state, joined by commas.")
+    ] = "",
+    ends_are_failures: Annotated[
+        bool, typer.Option(help="Episodes that the environment ended are ones in which the demonstrator failed.")
+    ] = False,
+) -> None:
+    """Make one file of demonstrations from files in other formats; each becomes a source, named by its file."""
+    from oodil.pipeline.data import Demonstrations
+    from oodil.pipeline.datasets import encode_demonstrations
+    from oodil.pipeline.datasets.foreign import read_foreign
+
+    parts = []
+    with _bad_input():
+        for source in sources:
+            label = source if source.startswith("minari:") else Path(source).stem
+            chosen = tuple(key for key in keys.split(",") if key)
+            part, recorded = read_foreign(source, label, chosen, ends_are_failures)
+            print(f"{source}: {len(part)} demonstrations" + (f" from {recorded}" if recorded else ""))
+            parts.append(part)
+        output.write_bytes(encode_demonstrations(Demonstrations.joined(parts), environment))
+    inspect_demos(output)
+
+
+@demos_app.command("export")
+def export_demos(
+    run_dir: RunPath,
+    target: Annotated[str, typer.Argument(help="FILE.csv, FILE.hdf5 (robomimic) or minari:DATASET_ID.")],
+) -> None:
+    """Write cluster, transferability and weight of every demonstration to a table, or to where they came from."""
+    from oodil.orchestrator import read_run
+    from oodil.pipeline.datasets.export import export
+    from oodil.pipeline.stages.demonstrations import load_demonstrations
+
+    with _bad_input():
+        opened = read_run(run_dir)
+        arrays = opened.artifact("transferability").arrays("transferability.safetensors")
+        columns = {"cluster": "clusters", "transferability": "scores", "weight": "weights"}
+        found = {name: arrays[held] for name, held in columns.items()}
+        print(export(load_demonstrations(opened), found, target))
+
+
+def _engine(
+    config: "RunConfig",
+    name: str,
+    workers: int | None,
+    bind: str | None = None,
+    keys: Path | None = None,
+    trust_cluster: bool = False,
+) -> "Engine":
+    """Return where jobs run; refuse options that belong to another engine."""
+    if name == "local":
+        from oodil.workers.channels import open_access
+        from oodil.workers.engine import LocalEngine
+
+        if trust_cluster:
+            raise ConfigError("--trust-cluster belongs to --engine ray")
+        count = config.runtime.workers if workers is None else workers
+        if bind is not None and count == 0:
+            raise ConfigError("--bind needs a learner process; --workers 0 runs everything in one")
+        return LocalEngine(count, access=open_access(bind, keys))
+    if (workers, bind, keys) != (None, None, None):
+        raise ConfigError("--workers, --bind and --keys belong to --engine local; a Ray cluster has its own workers")
+    try:
+        from oodil.workers.ray_engine import RayEngine, connect
+    except ImportError as error:
+        raise ConfigError(f"--engine ray needs Ray (pip install 'oodil[ray]'): {error}") from None
+    connect(trust_cluster)
+    return RayEngine()
+
+
+def _execute(opened: "Run", engine: "Engine", until: str | None, force: str | None) -> None:
+    """Walk the stages, then write the report and print the summary."""
+    from oodil.pipeline.report import write_report
+    from oodil.pipeline.results import summary
+    from oodil.pipeline.stages import stages
+    from oodil.terminal import print_summary
+
+    chosen = stages(opened.config)
+    names = [stage.name for stage in chosen]
+    with _bad_input():
+        for name in (until, force):
+            if name is not None and name not in names:
+                raise ConfigError(f"no stage {name!r}; this run has {', '.join(names)}")
+    try:
+        _walk(opened, chosen[: names.index(until or names[-1]) + 1], engine, force)
+    finally:
+        path = write_report(opened)
+    print_summary(summary(opened), path)
+
+
+def _walk(opened: "Run", chosen: list["Stage"], engine: "Engine", force: str | None) -> None:
+    from oodil.orchestrator import UnfinishedError, walk
+    from oodil.pipeline.loading import ConfigError
+
+    try:
+        walk(opened, chosen, engine, force)
+    except ConfigError as error:
+        print(f"oodil: {error}", file=sys.stderr)
+        raise typer.Exit(EXIT_BAD_INPUT) from None
+    except UnfinishedError as unfinished:
+        outcome = unfinished.outcome
+        for job, traceback in outcome.failed.items():
+            print(f"\n{unfinished.stage}/{job} failed:\n{traceback}", file=sys.stderr)
+        print(
+            f"\n{unfinished.stage}: {len(outcome.done)} jobs done, {len(outcome.failed)} failed, "
+            f"{len(outcome.not_run)} not finished. What is finished is kept; go on with: "
+            f"oodil resume {opened.directory.path}",
+            file=sys.stderr,
+        )
+        raise typer.Exit(EXIT_FAILED if outcome.failed else EXIT_STOPPED) from None
+    except KeyboardInterrupt:
+        print(f"\nstopped at once; go on with: oodil resume {opened.directory.path}", file=sys.stderr)
+        raise typer.Exit(EXIT_STOPPED) from None
+
+
+@contextmanager
+def _bad_input() -> Iterator[None]:
+    """Print what is wrong with the user's input in one message and exit with code 2."""
+    try:
+        yield
+    except OodilError as error:
+        print(f"oodil: {error}", file=sys.stderr)
+        raise typer.Exit(EXIT_BAD_INPUT) from None
+
+
+def main() -> None:
+    """Entry point of the ``oodil`` command."""
+    app()
+
+
+if __name__ == "__main__":
+    main()
