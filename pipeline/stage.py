@@ -4,6 +4,7 @@ A stage is a name, a version, its inputs and one or more independent jobs. It ne
 an engine (`oodil.workers.engine`) decides where its jobs run and who collects their rollouts.
 """
 
+import importlib
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -11,7 +12,7 @@ from typing import Any, Protocol
 from oodil.pipeline.artifacts import Artifact, Checkpoints, Files, RunDirectory, fingerprint, read_artifact
 from oodil.pipeline.collecting import RolloutSource
 from oodil.pipeline.config import RunConfig
-from oodil.pipeline.errors import NotFinishedError
+from oodil.pipeline.errors import ConfigError, NotFinishedError
 
 
 class JobStoppedError(Exception):
@@ -67,6 +68,11 @@ class Stage(ABC):
     distributed: bool = False
     """Whether rollout workers collect for its job; otherwise a job collects in its own process."""
 
+    @property
+    def module(self) -> str:
+        """The module that registers it; a process imports it before it runs a job of the stage."""
+        return type(self).__module__
+
     @abstractmethod
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return everything in the configuration that changes the result, as JSON values."""
@@ -105,6 +111,24 @@ class Stage(ABC):
     def checkpoints(self, run: Run, job: str) -> Checkpoints:
         """Return the checkpoints of a job."""
         return Checkpoints(run.directory.checkpoints(self.name, job), self.job_origin(run, job))
+
+
+_REGISTRY: dict[str, Stage] = {}
+
+
+def register(stage: Stage) -> None:
+    """Make a stage known by its name; the last line of the file that defines it."""
+    held = _REGISTRY.setdefault(stage.name, stage)
+    if held.module != stage.module:
+        raise ValueError(f"a stage {stage.name!r} is registered by {held.module} and by {stage.module}")
+
+
+def stage_named(name: str, module: str = "oodil.pipeline.stages") -> Stage:
+    """Return a registered stage; importing ``module`` registers it. Raises ConfigError, naming those there are."""
+    importlib.import_module(module)
+    if name not in _REGISTRY:
+        raise ConfigError(f"no stage {name!r}; there are {', '.join(_REGISTRY)}")
+    return _REGISTRY[name]
 
 
 def is_current(artifact: Artifact | None, origin: dict[str, Any]) -> bool:

@@ -4,25 +4,22 @@ A stage loads what it computes with inside ``run_job``, so that reading a run, o
 """
 
 from oodil.pipeline.config import RunConfig
-from oodil.pipeline.errors import ConfigError
-from oodil.pipeline.stage import Stage
-from oodil.pipeline.stages.clustering import ClusteringStage
-from oodil.pipeline.stages.demonstrations import DemonstrationsStage
-from oodil.pipeline.stages.experts import ExpertsStage
-from oodil.pipeline.stages.imitation import ImitationStage, NaiveGailStage, OracleStage
-from oodil.pipeline.stages.transferability import TransferabilityStage
+from oodil.pipeline.stage import Stage, stage_named
+from oodil.pipeline.stages import clustering, demonstrations, experts, imitation, transferability
+
+__all__ = ["clustering", "demonstrations", "experts", "imitation", "stages", "transferability"]
 
 
 def stages(config: RunConfig) -> list[Stage]:
     """Return the stages of a run, each after those it reads from."""
-    baselines: dict[str, Stage] = {stage.name: stage for stage in (NaiveGailStage(), OracleStage())}
-    method: list[Stage] = [DemonstrationsStage(), ClusteringStage(), TransferabilityStage(), ImitationStage()]
-    return method + [baselines[name] for name in config.baselines]
+    found: dict[str, Stage] = {}
 
+    def add(name: str) -> None:
+        stage = stage_named(name)
+        for needed in stage.inputs:
+            add(needed)
+        found.setdefault(name, stage)
 
-def stage_named(config: RunConfig, name: str) -> Stage:
-    """Return a stage of the run by its name. Raises ConfigError, naming those there are, if there is none."""
-    for stage in (*stages(config), ExpertsStage()):
-        if stage.name == name:
-            return stage
-    raise ConfigError(f"no stage {name!r}; this run has {', '.join(stage.name for stage in stages(config))}")
+    for name in ("imitation", *config.baselines):
+        add(name)
+    return list(found.values())

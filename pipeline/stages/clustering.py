@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from oodil.pipeline.artifacts import Files, encode_arrays, encode_json
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.stage import JobContext, JobStoppedError, Run, Stage
+from oodil.pipeline.stage import JobContext, JobStoppedError, Run, Stage, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 
 if TYPE_CHECKING:
@@ -115,3 +115,6 @@ def contingency(
 def purity(table: NDArray[np.int64]) -> float:
     """Return the share of demonstrations that come from the most frequent source of their cluster."""
     return float(table.max(axis=0).sum() / table.sum())
+
+
+register(ClusteringStage())

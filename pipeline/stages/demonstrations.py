@@ -13,7 +13,7 @@ from oodil.pipeline.datasets import decode_demonstrations, encode_demonstrations
 from oodil.pipeline.environments import make_batch
 from oodil.pipeline.errors import DataError
 from oodil.pipeline.experts import collect_demonstrations, hand_written, load_expert
-from oodil.pipeline.stage import JobContext, Run, Stage
+from oodil.pipeline.stage import JobContext, Run, Stage, register
 
 FILE = "demonstrations.safetensors"
 
@@ -142,3 +142,6 @@ def _files(demonstrations: Demonstrations, config: RunConfig, kept: dict[str, fl
         FILE: encode_demonstrations(demonstrations, config.environment.id),
         "demonstrations.json": encode_json(described),
     }
+
+
+register(DemonstrationsStage())

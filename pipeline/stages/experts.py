@@ -14,7 +14,7 @@ from oodil.pipeline.evaluation import evaluate
 from oodil.pipeline.experts import EXPERT_TRAINING, expert_files, train_expert
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.seeding import derive_key
-from oodil.pipeline.stage import JobContext, Run, Stage
+from oodil.pipeline.stage import JobContext, Run, Stage, register
 from oodil.pipeline.versions import library_versions
 
 TRAININGS = 2
@@ -112,3 +112,6 @@ def _reached(policy: GaussianPolicy, environment: EnvironmentConfig, seed: int) 
             "full_length_share": float((seen.lengths == seen.lengths.max()).mean()),
         }
     return reached
+
+
+register(ExpertsStage())

@@ -11,7 +11,7 @@ from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import make_batch
 from oodil.pipeline.evaluation import evaluate
 from oodil.pipeline.seeding import derive_key, torch_seed
-from oodil.pipeline.stage import JobContext, Run, Stage
+from oodil.pipeline.stage import JobContext, Run, Stage, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 
 
@@ -107,3 +107,8 @@ class OracleStage(ImitationStage):
         """Return one for demonstrations of a source that is marked transferable, zero for all others."""
         marks = [float(source.transferable is True) for source in run.config.demonstrations.sources]
         return np.array(marks)[demonstrations.sources]
+
+
+register(ImitationStage())
+register(NaiveGailStage())
+register(OracleStage())

@@ -21,7 +21,7 @@ from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import make_batch
 from oodil.pipeline.seeding import derive_key, torch_seed
-from oodil.pipeline.stage import JobContext, Run, Stage
+from oodil.pipeline.stage import JobContext, Run, Stage, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations, transferable_mask
 
 if TYPE_CHECKING:
@@ -183,3 +183,6 @@ def _cluster(job: str) -> int:
 
 def _labels(run: Run) -> np.ndarray:
     return run.artifact("clustering").arrays("assignment.safetensors")["labels"]
+
+
+register(TransferabilityStage())
