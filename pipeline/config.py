@@ -124,10 +124,6 @@ class TrainingConfig(_Section):
     """How the policy is improved."""
     value: ValueConfig = ValueConfig()
     """The value function."""
-    num_evaluations: int = Field(default=12, ge=0)
-    """Points of the learning curve; each is the deterministic policy on fresh episodes. Never used for learning."""
-    evaluation_episodes: PositiveInt = 8
-    """Episodes per point of the curve."""
     torch_threads: PositiveInt = 1
     """Threads of the learner; more do not help networks of this size, and change the bits."""
 
@@ -172,6 +168,11 @@ class SourceConfig(_Section):
     """Demonstrations to collect."""
     transferable: bool | None = None
     """Whether the imitator can reproduce it, if known: for the report and the oracle, never an input of the method."""
+
+    @property
+    def expert_folder(self) -> Path | None:
+        """The folder of a saved expert; None for a hand-written controller."""
+        return self.expert if isinstance(self.expert, Path) else None
 
 
 class DemonstrationsConfig(_Section):
@@ -247,9 +248,9 @@ class ClusteringConfig(_Section):
     @classmethod
     def _preset(cls, values: Any) -> Any:
         if isinstance(values, dict) and "preset" in values:
-            preset = CLUSTERING_PRESETS.get(values["preset"])
-            if preset is None:
+            if not isinstance(values["preset"], str) or values["preset"] not in CLUSTERING_PRESETS:
                 raise ValueError(f"preset is {values['preset']!r}; there are {', '.join(CLUSTERING_PRESETS)}")
+            preset = CLUSTERING_PRESETS[values["preset"]]
             return preset | {key: value for key, value in values.items() if key != "preset"}
         return values
 
@@ -281,8 +282,6 @@ class TransferabilityConfig(_Section):
     gail: GailConfig
     """Training of each job. ``anneal`` is off unless it is set: a discriminator that stops learning is fooled in the
     end, and the scores of what cannot be reproduced rise."""
-    num_scores: int = Field(default=100, ge=2)
-    """Times the demonstrations are scored while a job runs, evenly spaced."""
     final_steps: PositiveInt = 200
     """Steps that the discriminator takes against the finished imitator, which no longer learns, before it is read."""
     num_trainings: PositiveInt = 1
@@ -303,11 +302,20 @@ class ImitationConfig(_Section):
 
     gail: GailConfig
     """Training of the final policy, and of every baseline."""
+
+
+class EvaluationConfig(_Section):
+    """What is measured beside the training. Nothing here changes a policy or a score, so nothing is part of a
+    fingerprint: a finished training keeps the measurements that it was made with."""
+
+    num_points: int = Field(default=12, ge=0)
+    """Points of a policy's learning curve, each the mean action on fresh episodes."""
+    episodes: PositiveInt = 8
+    """Episodes per point of the curve."""
     final_episodes: PositiveInt = 32
-    """Deterministic episodes of the final evaluation."""
-
-
-Baseline = Literal["naive_gail", "oracle"]
+    """Episodes of the final evaluation; `oodil evaluate` runs more of a finished policy."""
+    num_scores: int = Field(default=100, ge=2)
+    """Times the demonstrations of a cluster are scored while its imitator is trained, for the report."""
 
 
 class RuntimeConfig(_Section):
@@ -346,14 +354,9 @@ class RunConfig(_Section):
     """What the imitator can reproduce."""
     imitation: ImitationConfig
     """The final policy."""
-    baselines: tuple[Baseline, ...] = ()
-    """What is trained beside it for comparison."""
+    baselines: tuple[str, ...] = ()
+    """Policies that are trained beside it for comparison, by their names in the registry (`naive_gail`, `oracle`)."""
+    evaluation: EvaluationConfig = EvaluationConfig()
+    """What is measured beside the training."""
     runtime: RuntimeConfig = RuntimeConfig()
     """How it runs."""
-
-    @model_validator(mode="after")
-    def _oracle_needs_labels(self) -> "RunConfig":
-        sources = self.demonstrations.sources
-        if "oracle" in self.baselines and not any(source.transferable for source in sources):
-            raise ValueError("baselines: the oracle needs sources that are marked transferable: true")
-        return self

@@ -4,7 +4,6 @@ import ctypes.util
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +16,11 @@ from oodil.pipeline.data import Episode
 from oodil.pipeline.environments import Simulators, make_batch
 from oodil.pipeline.errors import UnusableEnvironmentError
 from oodil.pipeline.policy import Controller, GaussianPolicy
+from oodil.pipeline.results import Evaluation
 from oodil.pipeline.seeding import Key, numpy_rng
 
 FRAMES_PER_SECOND = 30
 """Of a video, about; the environments run at 10 to 240 steps per second of simulated time."""
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """True returns and lengths of E episodes."""
-
-    returns: NDArray[np.float64]
-    """(E,)"""
-    lengths: NDArray[np.int64]
-    """(E,) steps."""
 
 
 def run_episodes(

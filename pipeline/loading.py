@@ -1,6 +1,8 @@
 """From a YAML file and overrides to a configuration; unknown keys are errors that name the nearest valid key."""
 
+import copy
 import difflib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +11,71 @@ from pydantic import BaseModel, ValidationError
 
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.errors import ConfigError
+from oodil.pipeline.stages import stages
+
+SHIPPED = Path(__file__).absolute().parents[1] / "configs"
+"""The configurations that come with oodil, beside this package and not found by way of a link to it."""
 
 
-def load_config(path: Path, overrides: list[str] | None = None) -> RunConfig:
-    """Read a YAML file, apply ``key.sub=value`` overrides and validate.
+def shipped_configs() -> dict[str, Path]:
+    """Return the configurations that come with oodil by name, such as ``hopper`` or ``quick/driving``."""
+    return {str(path.relative_to(SHIPPED).with_suffix("")): path for path in sorted(SHIPPED.rglob("*.yaml"))}
 
-    Paths in the file are taken relative to it. Raises ConfigError with one line per problem.
+
+def find_config(source: str | Path) -> Path:
+    """Return the file that a path, or else the name of a shipped configuration, stands for. Raises ConfigError."""
+    path = Path(source)
+    if path.is_file():
+        return path
+    shipped = shipped_configs()
+    name = str(source).removesuffix(".yaml")
+    if name in shipped:
+        return shipped[name]
+    near = difflib.get_close_matches(name, shipped, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(shipped)}"
+    raise ConfigError(f"{source}: no such file, and no configuration of this name comes with oodil; {hint}")
+
+
+def load_config(
+    source: str | Path | Mapping[str, Any] | RunConfig, overrides: Sequence[str] | None = None
+) -> RunConfig:
+    """Return a validated configuration.
+
+    Args:
+        source: a YAML file, the name of a shipped configuration, plain values or a configuration. Paths in a file are
+            relative to it, those in plain values to the working directory.
+        overrides: ``key.sub=value``, the value in YAML; a number reaches into a list: ``demonstrations.sources.2.count=5``.
+
+    Raises ConfigError with one line per problem.
     """
+    if isinstance(source, RunConfig):
+        values, origin, base = source.model_dump(mode="json"), "configuration", Path.cwd()
+    elif isinstance(source, Mapping):
+        values, origin, base = copy.deepcopy(dict(source)), "configuration", Path.cwd()
+    else:
+        path = find_config(source)
+        values, origin, base = _read_yaml(path), str(path), path.resolve().parent
+    for override in overrides or ():
+        _override(values, override)
+    return _resolve_paths(parse_config(values, origin), base)
+
+
+def parse_config(values: dict[str, Any], origin: str) -> RunConfig:
+    """Validate plain values. Raises ConfigError that names ``origin``, the key, the value and the nearest valid key."""
+    try:
+        config = RunConfig.model_validate(values)
+    except ValidationError as error:
+        problems = [_describe(problem) for problem in error.errors()]
+        raise ConfigError("\n".join(f"{origin}: {problem}" for problem in problems)) from None
+    try:
+        for stage in stages(config):
+            stage.check(config)
+    except ConfigError as error:
+        raise ConfigError(f"{origin}: {error}") from None
+    return config
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         values = yaml.safe_load(path.read_text())
     except OSError as error:
@@ -24,34 +84,32 @@ def load_config(path: Path, overrides: list[str] | None = None) -> RunConfig:
         raise ConfigError(f"{path}: not valid YAML: {error}") from error
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected a mapping of keys, found {type(values).__name__}")
-    for override in overrides or []:
-        _override(values, override)
-    config = parse_config(values, origin=str(path))
-    return _resolve_paths(config, path.resolve().parent)
-
-
-def parse_config(values: dict[str, Any], origin: str) -> RunConfig:
-    """Validate plain values. Raises ConfigError that names ``origin``, the key, the value and the nearest valid key."""
-    try:
-        return RunConfig.model_validate(values)
-    except ValidationError as error:
-        problems = [_describe(problem) for problem in error.errors()]
-        raise ConfigError("\n".join(f"{origin}: {problem}" for problem in problems)) from None
+    return values
 
 
 def _override(values: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     if not equals or not key:
         raise ConfigError(f"override {override!r} is not of the form key=value")
-    *parents, last = key.split(".")
-    for parent in parents:
-        values = values.setdefault(parent, {})
-        if not isinstance(values, dict):
-            raise ConfigError(f"override {override!r}: {parent} is not a section")
     try:
-        values[last] = yaml.safe_load(text)
+        value = yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise ConfigError(f"override {override!r}: the value is not valid YAML: {error}") from error
+    *parents, last = key.split(".")
+    place: Any = values
+    for parent in parents:
+        place = place.setdefault(parent, {}) if isinstance(place, dict) else place[_index(place, parent, override)]
+        if not isinstance(place, dict | list):
+            raise ConfigError(f"override {override!r}: {parent} is not a section")
+    place[last if isinstance(place, dict) else _index(place, last, override)] = value
+
+
+def _index(entries: list[Any], part: str, override: str) -> int:
+    if not part.isdecimal() or int(part) >= len(entries):
+        raise ConfigError(
+            f"override {override!r}: {part} is not an entry of the list, which has 0 to {len(entries) - 1}"
+        )
+    return int(part)
 
 
 def _describe(problem: Any) -> str:
@@ -92,8 +150,8 @@ def _resolve_paths(config: RunConfig, base: Path) -> RunConfig:
     demonstrations = config.demonstrations
     file = base / demonstrations.file if demonstrations.file else None
     sources = tuple(
-        s if isinstance(s.expert, str) else s.model_copy(update={"expert": base / s.expert})
-        for s in demonstrations.sources
+        source.model_copy(update={"expert": base / source.expert_folder}) if source.expert_folder else source
+        for source in demonstrations.sources
     )
     return config.model_copy(
         update={"demonstrations": demonstrations.model_copy(update={"file": file, "sources": sources})}

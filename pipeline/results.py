@@ -1,132 +1,388 @@
-"""What a run has produced so far, read from its artifacts; figures are taken as they were written, never recomputed."""
+"""What the stages leave behind, typed: each type knows its files, and nothing else names them or what is in them.
 
-import json
-from collections.abc import Callable
-from typing import Any
+``files()`` gives the content of an artifact, ``load(artifact)`` reads it back, checked against the manifest.
 
+Letters: N demonstrations, E embedding or episodes, K clusters, M points along a training, S observation, A action.
+"""
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Self
+
+import numpy as np
 from numpy.typing import NDArray
 
-from oodil.pipeline.artifacts import Artifact
-from oodil.pipeline.errors import DamagedArtifactError, NotFinishedError
-from oodil.pipeline.stage import Run
+from oodil.pipeline.artifacts import Artifact, Files, encode_arrays, encode_json
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.datasets.native import decode_demonstrations, encode_demonstrations
+from oodil.pipeline.errors import DamagedArtifactError, DataError
+from oodil.pipeline.policy import GaussianPolicy
 
-STAGES = ("demonstrations", "clustering", "transferability", "imitation", "naive_gail", "oracle")
-"""In the order in which they depend on each other."""
+_DEMONSTRATIONS, _SOURCES = "demonstrations.safetensors", "demonstrations.json"
+_ASSIGNMENT, _DIAGNOSTICS, _ENCODER = "assignment.safetensors", "diagnostics.json", "encoder.safetensors"
+_SCORES, _HISTORY, _SUMMARY = "transferability.safetensors", "history.safetensors", "summary.json"
+_POLICY, _POLICY_META, _DISCRIMINATOR = "policy.safetensors", "policy.json", "discriminator.safetensors"
+_CURVE, _EVALUATION = "curve.json", "evaluation.json"
+_IMITATORS, _JOB_SCORES = "imitators.json", "scores.safetensors"
+
+Arrays = dict[str, NDArray[Any]]
 
 
-class Results:
-    """The artifacts of a run that can be used now, and why the others cannot.
+@dataclass(frozen=True)
+class CollectedDemonstrations:
+    """Demonstrations, and how each source's were come by."""
 
-    An artifact counts only while its inputs are the ones that stand in the run directory, so figures of two different
-    sets of demonstrations never meet on one page.
-    """
+    demonstrations: Demonstrations
+    kept_share: tuple[float, ...] = ()
+    """By source, the share of collected episodes that were kept; empty for a file."""
+    environment_id: str = ""
 
-    def __init__(self, run: Run) -> None:
-        self.run = run
-        self.artifacts: dict[str, Artifact] = {}
-        self.problems: dict[str, str] = {}
-        """What is wrong with a stage; only of stages that this run is meant to have."""
-        expected = {*STAGES[:4], *run.config.baselines}
-        for stage in STAGES:
-            try:
-                artifact = run.artifact(stage)
-            except NotFinishedError:
-                if stage in expected:
-                    self.problems[stage] = "not finished"
-                continue
-            except DamagedArtifactError as error:
-                self.problems[stage] = f"damaged ({error})"
-                continue
-            changed = [name for name, sha256 in artifact.origin.get("inputs", {}).items() if self._hash(name) != sha256]
-            if changed:
-                self.problems[stage] = f"out of date, because {' and '.join(changed)} changed or went missing since"
-            else:
-                self.artifacts[stage] = artifact
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        return {
+            _DEMONSTRATIONS: encode_demonstrations(self.demonstrations, self.environment_id),
+            _SOURCES: encode_json({"kept_share": list(self.kept_share)}),
+        }
 
-    def _hash(self, stage: str) -> str | None:
-        return self.artifacts[stage].sha256 if stage in self.artifacts else None
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        path = str(artifact.path / _DEMONSTRATIONS)
+        demonstrations, environment_id = decode_demonstrations(artifact.read(_DEMONSTRATIONS), path)
+        return cls(demonstrations, tuple(artifact.json(_SOURCES)["kept_share"]), environment_id)
 
-    def json(self, stage: str, name: str) -> dict[str, Any]:
-        """Return the object in a JSON file of a stage; empty when it cannot be had."""
-        return self._read(stage, name, Artifact.json)
 
-    def arrays(self, stage: str, name: str) -> dict[str, NDArray[Any]]:
-        """Return the arrays in a file of a stage; empty when they cannot be had."""
-        return self._read(stage, name, Artifact.arrays)
+@dataclass(frozen=True)
+class Assignment:
+    """Which cluster each demonstration belongs to."""
 
-    def _read(self, stage: str, name: str, read: Callable[[Artifact, str], Any]) -> dict[str, Any]:
-        artifact = self.artifacts.get(stage)
-        if artifact is None or name not in artifact.hashes:
-            return {}
-        try:
-            return dict(read(artifact, name))
-        except DamagedArtifactError as error:
-            self.problems[stage] = f"damaged ({error})"
-            return {}
+    labels: NDArray[np.int32]
+    """(N,) cluster ids."""
+    features: NDArray[np.float32]
+    """(N, E) unit features."""
 
-    def env_steps(self) -> dict[str, int]:
-        """Return the environment steps that each finished training took."""
-        steps: dict[str, Any] = {stage: self.json(stage, "evaluation.json").get("env_steps") for stage in STAGES[3:]}
-        steps["transferability"] = self.json("transferability", "summary.json").get("env_steps")
-        return {stage: steps[stage] for stage in STAGES if steps.get(stage) is not None}
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        return {_ASSIGNMENT: encode_arrays({"labels": self.labels, "features": self.features})}
 
-    def seconds(self) -> dict[str, float]:
-        """Return how long each finished stage took, with what was spent on it before an interruption.
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        return cls(**_arrays(artifact, _ASSIGNMENT, cls))
 
-        A stage that is computed again counts anew, unless its jobs were reused: reading their scores in another way
-        takes no time, and says nothing of the time that they took.
+    def members(self, cluster: int) -> NDArray[np.intp]:
+        """Return the demonstrations of a cluster."""
+        return np.flatnonzero(self.labels == cluster)
+
+
+@dataclass(frozen=True)
+class ClusterDiagnostics:
+    """How good the clusters are; what needs the sources of the demonstrations is for reporting only."""
+
+    num_clusters: int
+    cluster_sizes: tuple[int, ...]
+    """(K,)"""
+    label_stability: float
+    """Share of single sub-trajectories whose own label is that of their demonstration."""
+    silhouette: float | None
+    """By cosine; None unless at least 2 clusters have members and one of them has more than one."""
+    calinski_harabasz: float | None
+    purity: float
+    """Share of demonstrations that come from the most frequent source of their cluster."""
+    contingency: tuple[tuple[int, ...], ...]
+    """(sources, K) demonstrations of each source in each cluster."""
+    shortened_subtrajectories: int
+    """Demonstrations that are too short for the common stride."""
+
+    @property
+    def non_empty_clusters(self) -> int:
+        """Clusters with members."""
+        return sum(size > 0 for size in self.cluster_sizes)
+
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        return {_DIAGNOSTICS: encode_json(vars(self))}
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        values = artifact.json(_DIAGNOSTICS)
+        values["cluster_sizes"] = tuple(values["cluster_sizes"])
+        values["contingency"] = tuple(map(tuple, values["contingency"]))
+        return cls(**values)
+
+
+def cluster_model_files(arrays: Arrays) -> Files:
+    """Return the file of a frozen encoder and its centers (`ClusterModel.arrays`)."""
+    return {_ENCODER: encode_arrays(arrays)}
+
+
+def load_cluster_model(artifact: Artifact) -> Arrays:
+    """Return what `ClusterModel.from_arrays` takes."""
+    return artifact.arrays(_ENCODER)
+
+
+@dataclass(frozen=True)
+class ScoreHistory:
+    """The mean logits of a cluster's demonstrations while its imitator was trained, and when it was read."""
+
+    demonstrations: NDArray[np.int64]
+    """(N_k,) which of all demonstrations they are."""
+    env_steps: NDArray[np.int64]
+    """(M,) environment steps of the job."""
+    logits: NDArray[np.float64]
+    """(M, N_k) high for demonstrations that the discriminator tells from the imitator."""
+
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        return {_JOB_SCORES: encode_arrays(vars(self))}
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        return cls(**_arrays(artifact, _JOB_SCORES, cls))
+
+    def then(self, env_steps: int, logits: NDArray[np.float64]) -> "ScoreHistory":
+        """Return this history with one more reading, after ``env_steps`` more."""
+        steps = np.append(self.env_steps, self.env_steps[-1] + env_steps)
+        return ScoreHistory(self.demonstrations, steps, np.concatenate((self.logits, logits[None])))
+
+
+@dataclass(frozen=True)
+class Imitator:
+    """A policy and the discriminator that it was trained against."""
+
+    policy: GaussianPolicy
+    discriminator: Arrays
+    """Its parameters by name."""
+
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        return {_POLICY: encode_arrays(self.policy.arrays()), _DISCRIMINATOR: encode_arrays(self.discriminator)}
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        return cls(_policy(artifact), artifact.arrays(_DISCRIMINATOR))
+
+
+@dataclass(frozen=True)
+class TrainedImitators:
+    """Which imitators were trained, and what that took."""
+
+    env_steps: int
+    """Environment steps of all of them together."""
+    sha256: dict[str, str]
+    """Of each job's artifact, by job."""
+
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        return {_IMITATORS: encode_json(vars(self))}
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        return cls(**artifact.json(_IMITATORS))
+
+
+@dataclass(frozen=True)
+class Transferability:
+    """What a weighting says of every demonstration."""
+
+    scores: NDArray[np.float64]
+    """(N,) in [0, 1], higher where the imitator can reproduce more."""
+    weights: NDArray[np.float64]
+    """(N,) not negative, summing to one."""
+    clusters: NDArray[np.int32]
+    """(N,) cluster ids; -1 for a weighting without clusters."""
+    env_steps: int = 0
+    """Environment steps that the weighting took."""
+    history: dict[int, ScoreHistory] = field(default_factory=dict)
+    """By cluster, for a weighting that reads jobs; the last reading is the one that counts."""
+
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        arrays: Arrays = {"scores": self.scores, "weights": self.weights, "clusters": self.clusters}
+        history: Arrays = {
+            f"cluster_{k}/{name}": array for k, seen in self.history.items() for name, array in vars(seen).items()
+        }
+        return {
+            _SCORES: encode_arrays(arrays),
+            _HISTORY: encode_arrays(history),
+            _SUMMARY: encode_json({"env_steps": self.env_steps}),
+        }
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        arrays = artifact.arrays(_SCORES)
+        named: dict[int, Arrays] = {}
+        for key, array in artifact.arrays(_HISTORY).items():
+            cluster, _, name = key.removeprefix("cluster_").partition("/")
+            named.setdefault(int(cluster), {})[name] = array
+        history = {k: ScoreHistory(**named[k]) for k in sorted(named)}
+        return cls(**arrays, env_steps=artifact.json(_SUMMARY)["env_steps"], history=history)
+
+    def table(self) -> list[dict[str, Any]]:
+        """Return one row a demonstration: its number, cluster, transferability and weight."""
+        return [
+            {"demonstration": n, "cluster": int(k), "transferability": float(score), "weight": float(weight)}
+            for n, (k, score, weight) in enumerate(zip(self.clusters, self.scores, self.weights, strict=True))
+        ]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """True returns and lengths of E episodes; for reporting, never for learning."""
+
+    returns: NDArray[np.float64]
+    """(E,)"""
+    lengths: NDArray[np.int64]
+    """(E,) steps."""
+
+    @property
+    def mean_return(self) -> float:
+        """Mean over the episodes; NaN where the environment's reward is."""
+        return float(self.returns.mean())
+
+    @property
+    def std_return(self) -> float:
+        """Standard deviation over the episodes."""
+        return float(self.returns.std())
+
+    @property
+    def mean_length(self) -> float:
+        """Mean steps of an episode."""
+        return float(self.lengths.mean())
+
+    def __len__(self) -> int:
+        return len(self.returns)
+
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        return {_EVALUATION: encode_json({"returns": self.returns.tolist(), "lengths": self.lengths.tolist()})}
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        values = artifact.json(_EVALUATION)
+        return cls(np.array(values["returns"], np.float64), np.array(values["lengths"], np.int64))
+
+
+@dataclass(frozen=True)
+class LearningCurve:
+    """The deterministic policy's true return along its training."""
+
+    env_steps: NDArray[np.int64]
+    """(M,)"""
+    mean_return: NDArray[np.float64]
+    """(M,)"""
+    std_return: NDArray[np.float64]
+    """(M,) over the episodes of a point."""
+    mean_length: NDArray[np.float64]
+    """(M,) steps."""
+    episodes: int
+    """Episodes per point."""
+
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        arrays = {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+        values = {name: array.tolist() for name, array in arrays.items()}
+        return {_CURVE: encode_json(values | {"episodes": self.episodes})}
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        values = artifact.json(_CURVE)
+        floats = {name: np.array(values[name], np.float64) for name in ("mean_return", "std_return", "mean_length")}
+        return cls(np.array(values["env_steps"], np.int64), **floats, episodes=values["episodes"])
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A trained policy as it is used: it flattens observations and clips actions as its training did."""
+
+    gaussian: GaussianPolicy
+    environment_id: str
+    observation_shape: tuple[int, ...]
+    action_low: NDArray[np.float32]
+    """In the shape of the action space."""
+    action_high: NDArray[np.float32]
+    env_steps: int = 0
+    """Environment steps of its training."""
+
+    def act(self, observation: NDArray[Any]) -> NDArray[np.float32]:
+        """Return the mean action for one observation, or for a batch (B, ...) of them.
+
+        Raises DataError when an observation has another shape than in training.
         """
-        spent: dict[str, float] = {}
-        finished: set[str] = set()
-        for event in _events(self.run):
-            stage, seconds = event.get("stage"), event.get("seconds")
-            if not isinstance(stage, str):
-                continue
-            if event.get("event") == "stage_started" and stage in finished and event.get("jobs") != 0:
-                spent[stage] = 0.0
-            if event.get("event") in ("stage_finished", "stage_interrupted") and isinstance(seconds, int | float):
-                spent[stage] = spent.get(stage, 0.0) + float(seconds)
-            if event.get("event") == "stage_finished":
-                finished.add(stage)
-        return {stage: seconds for stage, seconds in spent.items() if stage in finished}
+        seen = np.asarray(observation)
+        single = seen.shape == self.observation_shape
+        if not single and seen.shape[1:] != self.observation_shape:
+            raise DataError(f"observation has shape {seen.shape}; the policy was trained on {self.observation_shape}")
+        flat = seen.reshape(1 if single else len(seen), -1)
+        actions = self.gaussian.mean(flat).reshape(-1, *self.action_low.shape)
+        clipped = np.clip(actions, self.action_low, self.action_high)
+        return np.asarray(clipped[0] if single else clipped)
+
+    def predict(
+        self, observation: NDArray[Any], state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Return ``(action, state)`` as the policies of stable-baselines3 do; the policy keeps no state.
+
+        Only the mean action is deployed, so ``deterministic`` has to be true.
+        """
+        if not deterministic:
+            raise DataError("only the mean action of a trained policy is deployed; call predict(deterministic=True)")
+        return self.act(observation), state
+
+    def files(self) -> Files:
+        """Return the artifact's content; an infinite bound is null."""
+        described = {
+            "environment": self.environment_id,
+            "activation": "tanh",
+            "observation_shape": list(self.observation_shape),
+            "action_low": self.action_low.tolist(),
+            "action_high": self.action_high.tolist(),
+            "env_steps": self.env_steps,
+        }
+        return {_POLICY: encode_arrays(self.gaussian.arrays()), _POLICY_META: encode_json(described)}
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        described = artifact.json(_POLICY_META)
+        return cls(
+            gaussian=_policy(artifact),
+            environment_id=described["environment"],
+            observation_shape=tuple(described["observation_shape"]),
+            action_low=_bounds(described["action_low"], -np.inf),
+            action_high=_bounds(described["action_high"], np.inf),
+            env_steps=described["env_steps"],
+        )
 
 
-def summary(run: Run) -> dict[str, float]:
-    """Return the results known so far; a key is there only when its value is.
-
-    ``env_steps`` and ``seconds`` cover everything that was run: the jobs, the final policy and the baselines.
-    """
-    results = Results(run)
-    scores = results.json("transferability", "summary.json")
-    found = {
-        "final_return": results.json("imitation", "evaluation.json").get("final_return"),
-        "naive_return": results.json("naive_gail", "evaluation.json").get("final_return"),
-        "oracle_return": results.json("oracle", "evaluation.json").get("final_return"),
-        "purity": results.json("clustering", "diagnostics.json").get("purity"),
-        "auroc": scores.get("auroc"),
-        "transferable_share": scores.get("transferable_share"),
-        "env_steps": sum(results.env_steps().values()) or None,
-        "seconds": sum(results.seconds().values()) or None,
-    }
-    return {name: value for name, value in found.items() if value is not None}
+def discriminator_file(arrays: Arrays) -> Files:
+    """Return the file of a discriminator's parameters."""
+    return {_DISCRIMINATOR: encode_arrays(arrays)}
 
 
-def shown_return(value: float) -> str:
-    """Return an episode return in the digits that it deserves."""
-    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+def load_discriminator(artifact: Artifact) -> Arrays:
+    """Return a discriminator's parameters by name."""
+    return artifact.arrays(_DISCRIMINATOR)
 
 
-def _events(run: Run) -> list[dict[str, Any]]:
+def _arrays(artifact: Artifact, name: str, kind: type) -> Arrays:
+    arrays = artifact.arrays(name)
+    return {each.name: arrays[each.name] for each in fields(kind)}
+
+
+def _policy(artifact: Artifact) -> GaussianPolicy:
     try:
-        lines = run.directory.events.read_text(encoding="utf-8", errors="replace").splitlines()
-    except FileNotFoundError:
-        return []
-    events = []
-    for line in lines:
-        try:
-            event = json.loads(line)
-        except ValueError:  # a line cut short by a kill
-            continue
-        if isinstance(event, dict):
-            events.append(event)
-    return events
+        return GaussianPolicy.from_arrays(artifact.arrays(_POLICY))
+    except ValueError as error:
+        raise DamagedArtifactError(f"{artifact.path / _POLICY}: {error}") from error
+
+
+def _bounds(values: Any, unbounded: float) -> NDArray[np.float32]:
+    array = np.array(values, np.float32)  # null becomes NaN
+    return np.where(np.isnan(array), np.float32(unbounded), array)

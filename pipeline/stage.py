@@ -7,12 +7,12 @@ an engine (`oodil.workers.engine`) decides where its jobs run and who collects t
 import importlib
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from oodil.pipeline.artifacts import Artifact, Checkpoints, Files, RunDirectory, fingerprint, read_artifact
 from oodil.pipeline.collecting import RolloutSource
 from oodil.pipeline.config import RunConfig
-from oodil.pipeline.errors import ConfigError, NotFinishedError
+from oodil.pipeline.errors import ConfigError, DamagedArtifactError, NotFinishedError
 
 
 class JobStoppedError(Exception):
@@ -73,9 +73,15 @@ class Stage(ABC):
         """The module that registers it; a process imports it before it runs a job of the stage."""
         return type(self).__module__
 
+    def check(self, config: RunConfig) -> None:
+        """Raise ConfigError, before any work, for a configuration in which this stage cannot run."""
+
     @abstractmethod
     def settings(self, config: RunConfig) -> dict[str, Any]:
-        """Return everything in the configuration that changes the result, as JSON values."""
+        """Return everything in the configuration that changes the result, and nothing else, as JSON values.
+
+        What is only reported (labels, marks, evaluation) stays out: a change of it must not compute anything again.
+        """
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the part of the settings that its jobs depend on; all of it unless `combine` alone uses some."""
@@ -119,18 +125,64 @@ _REGISTRY: dict[str, Stage] = {}
 def register(stage: Stage) -> None:
     """Make a stage known by its name; the last line of the file that defines it."""
     held = _REGISTRY.setdefault(stage.name, stage)
-    if held.module != stage.module:
+    if held is not stage and held.module != stage.module:
         raise ValueError(f"a stage {stage.name!r} is registered by {held.module} and by {stage.module}")
 
 
-def stage_named(name: str, module: str = "oodil.pipeline.stages") -> Stage:
+_OURS = "oodil.pipeline.stages"
+"""Importing it registers our own stages."""
+
+
+def stage_named(name: str, module: str = _OURS) -> Stage:
     """Return a registered stage; importing ``module`` registers it. Raises ConfigError, naming those there are."""
-    importlib.import_module(module)
+    for each in (_OURS, module):
+        importlib.import_module(each)
     if name not in _REGISTRY:
         raise ConfigError(f"no stage {name!r}; there are {', '.join(_REGISTRY)}")
     return _REGISTRY[name]
 
 
-def is_current(artifact: Artifact | None, origin: dict[str, Any]) -> bool:
-    """Return whether an artifact was made from exactly this origin."""
-    return artifact is not None and artifact.fingerprint == fingerprint(origin)
+@dataclass(frozen=True)
+class StageState:
+    """Where a stage of a run stands."""
+
+    state: Literal["done", "stale", "damaged", "partial", "pending"]
+    """Stale: its artifact was made by other code, from other settings or from other inputs."""
+    reason: str = ""
+    """What is damaged, or the field that differs."""
+    artifact: Artifact | None = None
+    """There if it is done."""
+
+
+def state_of(stage: Stage, run: Run) -> StageState:
+    """Return where a stage stands, every file of its artifact checked."""
+    path = run.directory.stage(stage.name)
+    try:
+        artifact = read_artifact(path)
+        if artifact is None:
+            return StageState("partial" if run.directory.has_begun(stage.name) else "pending")
+        missing = [name for name in stage.inputs if read_artifact(run.directory.stage(name)) is None]
+        if missing:
+            return StageState("stale", f"its input {missing[0]} is missing")
+        origin = stage.origin(run)
+        if artifact.fingerprint != fingerprint(origin):
+            return StageState("stale", origin_difference(artifact.origin, origin))
+        artifact.verify()
+    except DamagedArtifactError as error:
+        return StageState("damaged", str(error))
+    return StageState("done", artifact=artifact)
+
+
+def origin_difference(old: Any, new: Any, key: str = "") -> str:
+    """Name the first place where two origins differ, as ``key old -> new``; empty where there is none."""
+    if old == new:
+        return ""
+    if isinstance(old, dict) and isinstance(new, dict):
+        name = next(name for name in sorted({*old, *new}) if old.get(name) != new.get(name))
+        return origin_difference(old.get(name), new.get(name), f"{key}.{name}" if key else name)
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        i = next(i for i, (a, b) in enumerate(zip(old, new, strict=True)) if a != b)
+        return origin_difference(old[i], new[i], f"{key}[{i}]")
+    if key.startswith("inputs."):
+        return f"its input {key.removeprefix('inputs.')} changed"
+    return f"{key.removeprefix('settings.')} {old!r} -> {new!r}"

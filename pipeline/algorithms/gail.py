@@ -95,6 +95,14 @@ class AdversarialReward:
         starts = self._starts[np.minimum(chosen, len(self._starts) - 1)]
         return self.discriminator.pairs(self._observations[starts], self._observations[starts + 1])
 
+    def discriminator_arrays(self) -> dict[str, NDArray[np.float32]]:
+        """Return the discriminator's parameters by name; `load_discriminator` is the inverse."""
+        return {name: value.numpy() for name, value in self.discriminator.state_dict().items()}
+
+    def load_discriminator(self, arrays: dict[str, NDArray[np.float32]]) -> None:
+        """Take over a trained discriminator."""
+        self.discriminator.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})
+
     def mean_logits(self, demonstrations: Demonstrations) -> NDArray[np.float64]:
         """Return (N,) mean logits of demonstrations by the discriminator as it stands."""
         return mean_logit_per_demonstration(self.discriminator, demonstrations)

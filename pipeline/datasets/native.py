@@ -39,11 +39,15 @@ def read_demonstrations(path: Path) -> tuple[Demonstrations, str]:
     ``observations`` and ``offsets`` are required; without ``sources`` all are from one source, without ``terminated``
     none ended in failure. Raises DataError that names the file and what is wrong with it.
     """
+    return decode_demonstrations(read_file(path), str(path))
+
+
+def read_file(path: Path) -> bytes:
+    """Return the bytes of a file. Raises DataError that names it."""
     try:
-        content = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise DataError(f"{path}: {error.strerror or error}") from error
-    return decode_demonstrations(content, str(path))
 
 
 def decode_demonstrations(content: bytes, origin: str) -> tuple[Demonstrations, str]:

@@ -19,6 +19,16 @@ from oodil.pipeline.errors import UnusableEnvironmentError
 _TRIAL_STEPS = 20
 
 
+def box_spaces(env: gymnasium.Env[Any, Any]) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    """Return observation and action space. Raises ValueError unless both are boxes."""
+    seen, action = env.observation_space, env.action_space
+    for what, space in (("observation", seen), ("action", action)):
+        if not isinstance(space, gymnasium.spaces.Box):
+            raise ValueError(f"the {what} space is {space}; only Box spaces can be used")
+    assert isinstance(seen, gymnasium.spaces.Box) and isinstance(action, gymnasium.spaces.Box)
+    return seen, action
+
+
 class ReplayBatch:
     """G Gymnasium environments side by side; the caller decides when an ended one is reset.
 
@@ -30,11 +40,7 @@ class ReplayBatch:
         self._environments = environments
         self.num_simulators = len(environments)
         self.max_episode_steps = max_episode_steps
-        seen, action = environments[0].observation_space, environments[0].action_space
-        for what, space in (("observation", seen), ("action", action)):
-            if not isinstance(space, gymnasium.spaces.Box):
-                raise ValueError(f"the {what} space is {space}; only Box spaces can be used")
-        assert isinstance(seen, gymnasium.spaces.Box) and isinstance(action, gymnasium.spaces.Box)
+        seen, action = box_spaces(environments[0])
         self._actions = action
         self.observation_dim = int(np.prod(seen.shape))
         self.action_dim = int(np.prod(action.shape))

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from html import escape
 
 from oodil.pipeline.report.collection import Source
-from oodil.pipeline.results import shown_return
+from oodil.pipeline.runs import shown_return
 
 TITLES = {
     "demonstrations": "demonstrations",

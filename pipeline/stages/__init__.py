@@ -1,17 +1,34 @@
-"""The stages, in order; which of them a run has follows from its configuration.
+"""The stages; which of them a run has follows from its configuration.
 
-A stage loads what it computes with inside ``run_job``, so that reading a run, or starting one, does not wait for torch.
+Importing this package registers them. A stage loads what it computes with inside ``run_job``, so that reading a run, or
+starting one, does not wait for torch.
 """
 
 from oodil.pipeline.config import RunConfig
+from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.stage import Stage, stage_named
-from oodil.pipeline.stages import clustering, demonstrations, experts, imitation, transferability
+from oodil.pipeline.stages import clustering, demonstrations, experts, imitators, marks, policies, transferability
+from oodil.pipeline.stages.policies import PolicyStage
+from oodil.pipeline.stages.weighting import Weighting
 
-__all__ = ["clustering", "demonstrations", "experts", "imitation", "stages", "transferability"]
+__all__ = [
+    "PolicyStage",
+    "Weighting",
+    "clustering",
+    "demonstrations",
+    "experts",
+    "imitators",
+    "marks",
+    "policies",
+    "policies_of",
+    "stages",
+    "transferability",
+    "weightings_of",
+]
 
 
 def stages(config: RunConfig) -> list[Stage]:
-    """Return the stages of a run, each after those it reads from."""
+    """Return the stages of a run, each after those it reads from. Raises ConfigError for a policy that is not known."""
     found: dict[str, Stage] = {}
 
     def add(name: str) -> None:
@@ -21,5 +38,20 @@ def stages(config: RunConfig) -> list[Stage]:
         found.setdefault(name, stage)
 
     for name in ("imitation", *config.baselines):
+        try:
+            if not isinstance(stage_named(name), PolicyStage):
+                raise ConfigError(f"{name!r} is not a policy")
+        except ConfigError as error:
+            raise ConfigError(f"baselines: {error}") from None
         add(name)
     return list(found.values())
+
+
+def policies_of(config: RunConfig) -> list[PolicyStage]:
+    """Return the policies of a run, ours first."""
+    return [stage for stage in stages(config) if isinstance(stage, PolicyStage)]
+
+
+def weightings_of(config: RunConfig) -> list[Weighting]:
+    """Return the weightings of a run, ours first."""
+    return [stage for stage in stages(config) if isinstance(stage, Weighting)]

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oodil.pipeline.artifacts import Files, encode_arrays, encode_json
+from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.results import Assignment, ClusterDiagnostics, cluster_model_files
 from oodil.pipeline.stage import JobContext, JobStoppedError, Run, Stage, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 
@@ -23,7 +24,7 @@ class ClusteringStage(Stage):
     """Contrastive clustering of whole demonstrations (`oodil.pipeline.algorithms.clustering`)."""
 
     name = "clustering"
-    version = 1
+    version = 2
     inputs = ("demonstrations",)
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
@@ -33,10 +34,7 @@ class ClusteringStage(Stage):
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Train the encoder and the centers, or continue from a checkpoint, and label every demonstration.
 
-        Returns:
-            assignment.safetensors: labels (N,) int32 and features (N, E) float32.
-            encoder.safetensors: the cluster model, see `ClusterModel.from_arrays`.
-            diagnostics.json: see `diagnostics`.
+        The artifact holds an `Assignment`, the cluster model and its `ClusterDiagnostics`.
         """
         import torch
         from threadpoolctl import threadpool_limits
@@ -51,13 +49,10 @@ class ClusteringStage(Stage):
             self._train(clustering, run, job, context)
             model = clustering.model()
             labelling = model.label(demonstrations, run.config.clustering.label_draws, run.config.seed)
-            report = diagnostics(labelling, demonstrations, len(model.centers))
-            report["shortened_subtrajectories"] = model.sampling.num_shortened(demonstrations.lengths)
-        return {
-            "assignment.safetensors": encode_arrays({"labels": labelling.labels, "features": labelling.features}),
-            "encoder.safetensors": encode_arrays(model.arrays()),
-            "diagnostics.json": encode_json(report),
-        }
+            shortened = model.sampling.num_shortened(demonstrations.lengths)
+            found = diagnostics(labelling, demonstrations, len(model.centers), shortened)
+        assignment = Assignment(labelling.labels, labelling.features)
+        return assignment.files() | cluster_model_files(model.arrays()) | found.files()
 
     def _train(self, clustering: "ContrastiveClustering", run: Run, job: str, context: JobContext) -> None:
         checkpoints = self.checkpoints(run, job)
@@ -78,29 +73,28 @@ class ClusteringStage(Stage):
                 raise JobStoppedError
 
 
-def diagnostics(labelling: "Labelling", demonstrations: Demonstrations, num_clusters: int) -> dict[str, Any]:
-    """Return what the report says about an assignment; what needs source labels is for reporting only.
-
-    silhouette (by cosine) and calinski_harabasz are None unless there are at least 2 clusters with members and one of
-    them has more than one; contingency is {source label: demonstrations per cluster}.
-    """
+def diagnostics(
+    labelling: "Labelling", demonstrations: Demonstrations, num_clusters: int, shortened_subtrajectories: int = 0
+) -> ClusterDiagnostics:
+    """Return what is said about an assignment; what needs the sources is for reporting only."""
     from sklearn.metrics import calinski_harabasz_score, silhouette_score
 
     sizes = np.bincount(labelling.labels, minlength=num_clusters)
-    non_empty = int((sizes > 0).sum())
-    scores: dict[str, float | None] = {"silhouette": None, "calinski_harabasz": None}
-    if 2 <= non_empty < len(labelling.labels):
-        scores["silhouette"] = float(silhouette_score(labelling.features, labelling.labels, metric="cosine"))
-        scores["calinski_harabasz"] = float(calinski_harabasz_score(labelling.features, labelling.labels))
+    silhouette = calinski_harabasz = None
+    if 2 <= int((sizes > 0).sum()) < len(labelling.labels):
+        silhouette = float(silhouette_score(labelling.features, labelling.labels, metric="cosine"))
+        calinski_harabasz = float(calinski_harabasz_score(labelling.features, labelling.labels))
     table = contingency(labelling.labels, demonstrations.sources, num_clusters, len(demonstrations.source_labels))
-    return scores | {
-        "num_clusters": num_clusters,
-        "non_empty_clusters": non_empty,
-        "cluster_sizes": sizes.tolist(),
-        "label_stability": labelling.stability,
-        "purity": purity(table),
-        "contingency": dict(zip(demonstrations.source_labels, table.tolist(), strict=True)),
-    }
+    return ClusterDiagnostics(
+        num_clusters=num_clusters,
+        cluster_sizes=tuple(sizes.tolist()),
+        label_stability=labelling.stability,
+        silhouette=silhouette,
+        calinski_harabasz=calinski_harabasz,
+        purity=purity(table),
+        contingency=tuple(map(tuple, table.tolist())),
+        shortened_subtrajectories=shortened_subtrajectories,
+    )
 
 
 def contingency(

@@ -1,38 +1,44 @@
 """Stage 1: the demonstrations, collected from saved experts (one job per source) or read from a file."""
 
 import hashlib
-import re
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from oodil.pipeline.artifacts import Files, encode_json
+from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
-from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.datasets import decode_demonstrations, encode_demonstrations, read_demonstrations
-from oodil.pipeline.environments import make_batch
-from oodil.pipeline.errors import DataError
-from oodil.pipeline.experts import collect_demonstrations, hand_written, load_expert
+from oodil.pipeline.data import Demonstrations, Episode
+from oodil.pipeline.datasets import read_demonstrations, read_file
+from oodil.pipeline.environments import Simulators, make_batch
+from oodil.pipeline.errors import DataError, ExpertError
+from oodil.pipeline.evaluation import run_episodes
+from oodil.pipeline.policy import Controller, GaussianPolicy
+from oodil.pipeline.results import CollectedDemonstrations
+from oodil.pipeline.seeding import derive_key, numpy_rng
 from oodil.pipeline.stage import JobContext, Run, Stage, register
+from oodil.pipeline.stages.experts import load_expert
 
-FILE = "demonstrations.safetensors"
+COLLECTION_SIMULATORS = 16
+"""Episodes collected side by side; part of what the demonstrations depend on."""
 
 
 class DemonstrationsStage(Stage):
-    """Collects or reads; the files are ``demonstrations.safetensors`` and ``demonstrations.json``."""
+    """Collects or reads; its artifact is `CollectedDemonstrations`, whose sources are numbered as configured.
+
+    Labels and marks are not part of it: they are reported only, and stay in the configuration.
+    """
 
     name = "demonstrations"
-    version = 1
+    version = 2
     inputs = ()
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the sources with the content of their experts, or the content of the file."""
         section = config.demonstrations
-        common = {"environment": config.environment.id, "own_dynamics": config.environment.dynamics}
+        common = {"environment": config.environment.id}
         if section.file is not None:
-            return common | {"file_sha256": hashlib.sha256(section.file.read_bytes()).hexdigest()}
+            return common | {"file_sha256": hashlib.sha256(read_file(section.file)).hexdigest()}
         sources = [
-            source.model_dump(mode="json", exclude={"expert"}) | {"expert_sha256": _identity(source)}
+            {"dynamics": source.dynamics, "count": source.count, "expert_sha256": _identity(source)}
             for source in section.sources
         ]
         flags = section.model_dump(include={"deterministic", "full_length_only", "minimum_return"})
@@ -40,8 +46,7 @@ class DemonstrationsStage(Stage):
 
     def jobs(self, run: Run) -> list[str]:
         """Return one job per source, or the stage itself for a file."""
-        sources = run.config.demonstrations.sources
-        return [_job_name(i, source) for i, source in enumerate(sources)] or [self.name]
+        return [f"source-{i}" for i in range(len(run.config.demonstrations.sources))] or [self.name]
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Collect from one source, or take over the file."""
@@ -49,52 +54,46 @@ class DemonstrationsStage(Stage):
         section = config.demonstrations
         if section.file is not None:
             demonstrations, _ = read_demonstrations(section.file)
-            return _files(demonstrations, config, {})
-        names = self.jobs(run)
-        source = section.sources[names.index(job)]
-        environment = EnvironmentConfig(id=config.environment.id, dynamics=source.dynamics)
-        demonstrations, kept = collect_demonstrations(
-            None if isinstance(source.expert, str) else load_expert(source.expert)[0],
-            environment,
-            source.label,
-            source.count,
-            config.seed,
-            deterministic=section.deterministic,
-            full_length_only=section.full_length_only,
-            minimum_return=section.minimum_return,
-            context=context,
-        )
-        return {
-            FILE: encode_demonstrations(demonstrations, config.environment.id),
-            "source.json": encode_json({"label": source.label, "kept_share": kept}),
-        }
+            return CollectedDemonstrations(demonstrations, (), config.environment.id).files()
+        index = self.jobs(run).index(job)
+        source = section.sources[index]
+        try:
+            demonstrations, kept = collect_demonstrations(
+                load_expert(source.expert_folder)[0] if source.expert_folder else None,
+                EnvironmentConfig(id=config.environment.id, dynamics=source.dynamics),
+                index,
+                source.count,
+                config.seed,
+                deterministic=section.deterministic,
+                full_length_only=section.full_length_only,
+                minimum_return=section.minimum_return,
+                context=context,
+            )
+        except DataError as error:
+            raise DataError(f"source {source.label!r}: {error}") from error
+        return CollectedDemonstrations(demonstrations, (kept,), config.environment.id).files()
 
     def combine(self, run: Run) -> Files | None:
         """Join the sources, in the order of the configuration."""
-        sources = run.config.demonstrations.sources
-        if not sources:
+        if not run.config.demonstrations.sources:
             return None
-        parts, kept = [], {}
-        for job in self.jobs(run):
-            artifact = run.job_artifact(self.name, job)
-            parts.append(decode_demonstrations(artifact.read(FILE), str(artifact.path / FILE))[0])
-            described = artifact.json("source.json")
-            kept[described["label"]] = described["kept_share"]
-        return _files(Demonstrations.joined(parts), run.config, kept)
+        parts = [CollectedDemonstrations.load(run.job_artifact(self.name, job)) for job in self.jobs(run)]
+        joined = Demonstrations.joined([part.demonstrations for part in parts])
+        return CollectedDemonstrations(
+            joined, tuple(share for part in parts for share in part.kept_share), run.config.environment.id
+        ).files()
 
 
 def load_demonstrations(run: Run) -> Demonstrations:
-    """Return the demonstrations of a run whose first stage is finished."""
-    artifact = run.artifact(DemonstrationsStage.name)
-    return decode_demonstrations(artifact.read(FILE), str(artifact.path / FILE))[0]
+    """Return the demonstrations of a run whose first stage is finished, under the labels of its configuration."""
+    held = CollectedDemonstrations.load(run.artifact(DemonstrationsStage.name)).demonstrations
+    labels = tuple(source.label for source in run.config.demonstrations.sources)
+    return replace(held, source_labels=labels) if labels else held
 
 
-def transferable_mask(config: RunConfig, demonstrations: Demonstrations) -> np.ndarray | None:
-    """Return (N,) whether each demonstration's source is marked transferable; None unless every source is marked."""
-    marks = [source.transferable for source in config.demonstrations.sources]
-    if not marks or None in marks:
-        return None
-    return np.array(marks, np.bool_)[demonstrations.sources]
+def transferable_marks(config: RunConfig) -> list[bool | None]:
+    """Return whether each source is marked transferable, by source; empty for demonstrations from a file."""
+    return [source.transferable for source in config.demonstrations.sources]
 
 
 def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
@@ -110,10 +109,10 @@ def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
         if environment and environment != config.environment.id:
             raise DataError(f"{section.file}: recorded in {environment}, but the run is for {config.environment.id}")
     for source in section.sources:
-        if isinstance(source.expert, str):
+        if source.expert_folder is None:
             hand_written(make_batch(config.environment.id, source.dynamics, 1), config.environment.id)
             continue
-        policy, _ = load_expert(source.expert)
+        policy, _ = load_expert(source.expert_folder)
         if len(policy.input_mean) != observation_dim:
             raise DataError(
                 f"{source.expert}: the expert sees {len(policy.input_mean)} dimensions; "
@@ -121,27 +120,61 @@ def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
             )
 
 
+def hand_written(simulators: Simulators, env_id: str) -> Controller:
+    """Return the controller that an environment brings along. Raises ExpertError if it brings none."""
+    if not hasattr(simulators, "demonstrator"):
+        raise ExpertError(f"{env_id} brings no hand-written controller; name the folder of a saved expert")
+    controller: Controller = simulators.demonstrator()
+    return controller
+
+
+def collect_demonstrations(
+    policy: GaussianPolicy | None,
+    environment: EnvironmentConfig,
+    source: int,
+    count: int,
+    seed: int,
+    *,
+    deterministic: bool,
+    full_length_only: bool,
+    minimum_return: float | None,
+    context: JobContext,
+) -> tuple[Demonstrations, float]:
+    """Collect ``count`` demonstrations and return them with the share of episodes that were kept.
+
+    The number of the ``source`` and the ``seed`` name the random stream; what the source is called does not matter.
+    Without a policy, the environment's hand-written controller acts; it does as it does, ``deterministic`` or not.
+
+    Raises DataError when fewer than one episode in ten can be kept.
+    """
+    simulators = make_batch(environment.id, environment.dynamics, COLLECTION_SIMULATORS)
+    controller = policy or hand_written(simulators, environment.id)
+    kept: list[Episode] = []
+    rounds = 0
+    while len(kept) < count:
+        rounds += 1
+        key = derive_key(seed, "demonstrations", source, rounds)
+        stochastic = policy is not None and not deterministic
+        episodes = run_episodes(simulators, controller, numpy_rng(key), stochastic=stochastic)
+        if full_length_only:
+            episodes = [each for each in episodes if len(each.states) == simulators.max_episode_steps + 1]
+        if minimum_return is not None:
+            episodes = [replace(each, terminated=False) for each in episodes if each.env_return >= minimum_return]
+        kept += episodes
+        if len(kept) * 10 < rounds * COLLECTION_SIMULATORS:
+            raise DataError(
+                f"only {len(kept)} of {rounds * COLLECTION_SIMULATORS} episodes can be kept "
+                f"(full_length_only: {full_length_only}, minimum_return: {minimum_return}); train a better expert or "
+                "ask for less"
+            )
+        context.progress(min(len(kept), count), count)
+    share = len(kept) / (rounds * COLLECTION_SIMULATORS)
+    return Demonstrations.of(kept[:count], f"source {source}"), share
+
+
 def _identity(source: SourceConfig) -> str:
-    return source.expert if isinstance(source.expert, str) else load_expert(source.expert)[1].sha256
-
-
-def _job_name(index: int, source: SourceConfig) -> str:
-    return f"{index}-{re.sub(r'[^A-Za-z0-9.]+', '-', source.label).strip('-')}"
-
-
-def _files(demonstrations: Demonstrations, config: RunConfig, kept: dict[str, float]) -> Files:
-    described = {
-        "environment": config.environment.model_dump(mode="json"),
-        "source_labels": demonstrations.source_labels,
-        "transferable": [source.transferable for source in config.demonstrations.sources]
-        or [None] * len(demonstrations.source_labels),
-        "source_dynamics": [source.dynamics for source in config.demonstrations.sources],
-        "kept_share": kept,
-    }
-    return {
-        FILE: encode_demonstrations(demonstrations, config.environment.id),
-        "demonstrations.json": encode_json(described),
-    }
+    """Return what an expert is, whatever its folder is called."""
+    return load_expert(source.expert_folder)[1].sha256 if source.expert_folder else str(source.expert)
 
 
 register(DemonstrationsStage())

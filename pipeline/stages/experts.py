@@ -1,17 +1,26 @@
-"""Training the experts of a configuration: a stage of its own, run by ``oodil demos collect --train`` alone.
+"""Experts: policies trained on the true reward of a demonstrator's dynamics; the only place that learns from it.
 
-Each source gets two independent trainings, and the one with the higher sampled return is kept; one that falls has a
-low one. This selection, like the training itself, uses the true reward, as making a demonstrator does; no later stage
-sees it.
+The stage is run by ``oodil demos collect --train`` alone. Each source gets two independent trainings, and the one with
+the higher sampled return is kept, because one that falls has a low one. A saved expert is an artifact folder with the
+policy and what it reaches.
 """
 
 from pathlib import Path
 from typing import Any
 
-from oodil.pipeline.artifacts import Files, encode_json, write_artifact
-from oodil.pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
+from oodil.pipeline.artifacts import (
+    Artifact,
+    Checkpoints,
+    Files,
+    encode_arrays,
+    encode_json,
+    read_artifact,
+    write_artifact,
+)
+from oodil.pipeline.config import EnvironmentConfig, PpoConfig, RunConfig, SourceConfig, TrainingConfig, ValueConfig
+from oodil.pipeline.environments import environment_spec
+from oodil.pipeline.errors import DamagedArtifactError, ExpertError
 from oodil.pipeline.evaluation import evaluate
-from oodil.pipeline.experts import EXPERT_TRAINING, expert_files, train_expert
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.seeding import derive_key
 from oodil.pipeline.stage import JobContext, Run, Stage, register
@@ -20,6 +29,22 @@ from oodil.pipeline.versions import library_versions
 TRAININGS = 2
 """Seeds tried per source."""
 EVALUATION_EPISODES = 64
+
+
+EXPERT_TRAINING = TrainingConfig(
+    total_steps=2_500_000,
+    num_groups=4,
+    simulators_per_group=16,
+    steps_per_rollout=64,
+    lag=0,
+    discount=0.995,
+    gae_lambda=0.97,
+    normalize_observations=True,
+    scale_rewards=True,
+    policy_optimizer=PpoConfig(learning_rate=1e-3, epochs=5, minibatch_size=512),
+    value=ValueConfig(learning_rate=1e-3, epochs=5, minibatch_size=512),
+)
+"""What an expert is trained with unless its source says otherwise."""
 
 
 class ExpertsStage(Stage):
@@ -32,8 +57,8 @@ class ExpertsStage(Stage):
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return what the trainings depend on."""
         sources = {
-            source.label: source.model_dump(mode="json", include={"dynamics", "expert_discount"})
-            for source in config.demonstrations.sources
+            str(i): source.model_dump(mode="json", include={"dynamics", "expert_discount"})
+            for i, source in enumerate(config.demonstrations.sources)
         }
         training = EXPERT_TRAINING.model_dump(mode="json")
         return {"environment": config.environment.id, "sources": sources, "training": training}
@@ -45,7 +70,7 @@ class ExpertsStage(Stage):
 
     @staticmethod
     def _trained(run: Run) -> list[tuple[int, SourceConfig]]:
-        return [(i, s) for i, s in enumerate(run.config.demonstrations.sources) if not isinstance(s.expert, str)]
+        return [(i, source) for i, source in enumerate(run.config.demonstrations.sources) if source.expert_folder]
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Train one expert and say what it reaches with sampled and with mean actions."""
@@ -70,15 +95,15 @@ class ExpertsStage(Stage):
                 for job in self.jobs(run)
                 if job.startswith(f"source-{i}-")
             }
-            chosen[source.label] = max(returns, key=lambda job: returns[job])
+            chosen[str(i)] = max(returns, key=lambda job: returns[job])
         return {"chosen.json": encode_json(chosen)}
 
     def export(self, run: Run) -> list[str]:
         """Save each source's expert in its folder; return a line about each."""
         chosen = run.artifact(self.name).json("chosen.json")
         lines = []
-        for _, source in self._trained(run):
-            trained = run.job_artifact(self.name, chosen[source.label])
+        for i, source in self._trained(run):
+            trained = run.job_artifact(self.name, chosen[str(i)])
             files = {name: trained.read(name) for name in trained.hashes}
             write_artifact(Path(source.expert), {"expert": source.dynamics}, files, library_versions())
             reached = trained.json("expert.json")["stochastic"]
@@ -87,6 +112,35 @@ class ExpertsStage(Stage):
                 f"{reached['full_length_share']:.0%} of sampled episodes last -> {source.expert}"
             )
         return lines
+
+
+def train_expert(
+    environment: EnvironmentConfig, config: TrainingConfig, seed: int, context: JobContext, checkpoints: Checkpoints
+) -> GaussianPolicy:
+    """Train one expert on the environment's reward."""
+    from oodil.pipeline.algorithms.learner import EnvReward, Learner
+    from oodil.pipeline.training import train
+
+    spec = environment_spec(environment.id, environment.dynamics)
+    learner = Learner(spec.observation_dim, spec.action_dim, config, EnvReward(), seed)
+    train(learner, environment, config, [], context, checkpoints)
+    return learner.behavior_policy()
+
+
+def expert_files(policy: GaussianPolicy, description: dict[str, Any]) -> Files:
+    """Return the files of a saved expert; ``description`` says for what it was trained and what it reaches."""
+    return {"policy.safetensors": encode_arrays(policy.arrays()), "expert.json": encode_json(description)}
+
+
+def load_expert(path: Path) -> tuple[GaussianPolicy, Artifact]:
+    """Return a saved expert's policy and its artifact. Raises ExpertError unless it is there and sound."""
+    try:
+        artifact = read_artifact(path)
+        if artifact is None:
+            raise ExpertError(f"{path}: no expert is saved here")
+        return GaussianPolicy.from_arrays(artifact.arrays("policy.safetensors")), artifact
+    except (DamagedArtifactError, ValueError) as error:
+        raise ExpertError(str(error)) from error
 
 
 def _job(source: int, seed: int) -> str:
@@ -106,9 +160,9 @@ def _reached(policy: GaussianPolicy, environment: EnvironmentConfig, seed: int) 
         )
         reached[name] = {
             "episodes": EVALUATION_EPISODES,
-            "return_mean": float(seen.returns.mean()),
-            "return_std": float(seen.returns.std()),
-            "length_mean": float(seen.lengths.mean()),
+            "return_mean": seen.mean_return,
+            "return_std": seen.std_return,
+            "length_mean": seen.mean_length,
             "full_length_share": float((seen.lengths == seen.lengths.max()).mean()),
         }
     return reached

@@ -1,188 +1,131 @@
-"""Stage 3: one independent GAIL job per cluster; what its discriminators say of every demonstration (Eqn 5 and 6).
+"""Stage 4: how transferable every demonstration is, read from the discriminators of the clusters' imitators (Eqn 6).
 
-The scores are read from each job's discriminator after it has gone on learning for a while against the finished
-imitator. The true reward plays no part.
+A discriminator is read after it has gone on learning for a while against the finished imitator. One job per imitator;
+what is done with the readings (which training counts, weights) trains nothing again.
 """
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from oodil.pipeline.algorithms.weights import (
-    sampling_mass,
-    share_lasted,
-    sharpened_weights,
-    transferability,
-)
-from oodil.pipeline.artifacts import Files, encode_arrays, encode_json
+from oodil.pipeline.algorithms.weights import share_lasted, sharpened_weights, transferability_of_logits
+from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.environments import make_batch
-from oodil.pipeline.seeding import derive_key, torch_seed
-from oodil.pipeline.stage import JobContext, Run, Stage, register
-from oodil.pipeline.stages.demonstrations import load_demonstrations, transferable_mask
-
-if TYPE_CHECKING:
-    from oodil.pipeline.algorithms.gail import AdversarialReward
-    from oodil.pipeline.algorithms.learner import Learner
-
-_JOB_FILE = "scores.safetensors"
-
-
-@dataclass(frozen=True)
-class ClusterJob:
-    """The demonstrations of one cluster and an imitator of them in its own environment."""
-
-    config: RunConfig
-    members: NDArray[np.intp]
-    """Which of all demonstrations they are."""
-    demonstrations: Demonstrations
-    reward: "AdversarialReward"
-    learner: "Learner"
-    seed: int
-
-    @classmethod
-    def of(cls, run: Run, job: str) -> "ClusterJob":
-        """Return the job of that name, untrained."""
-        from oodil.pipeline.algorithms.gail import AdversarialReward
-        from oodil.pipeline.algorithms.learner import Learner
-
-        environment, gail = run.config.environment, run.config.transferability.gail
-        members = np.flatnonzero(_labels(run) == _cluster(job))
-        demonstrations = load_demonstrations(run).select(members)
-        seed = torch_seed(derive_key(run.config.seed, TransferabilityStage.name, job))
-        simulators = make_batch(environment.id, environment.dynamics, 1)
-        reward = AdversarialReward(demonstrations, np.ones(len(members)), gail.discriminator, seed)
-        learner = Learner(simulators.observation_dim, simulators.action_dim, gail, reward, seed)
-        return cls(run.config, members, demonstrations, reward, learner, seed)
-
-    def settle(self, context: JobContext) -> int:
-        """Let the discriminator go on against the imitator as it is now; return the environment steps it saw."""
-        from oodil.pipeline.training import experience
-
-        environment, section = self.config.environment, self.config.transferability
-        horizon = make_batch(environment.id, environment.dynamics, 1).max_episode_steps
-        policy = self.learner.behavior_policy()
-        rollouts = experience(policy, environment, section.gail, horizon, self.seed, context)
-        self.reward.settle(rollouts, section.final_steps, section.gail.steps_per_iteration)
-        return sum(rollout.terminated.size for rollout in rollouts)
+from oodil.pipeline.environments import environment_spec
+from oodil.pipeline.results import (
+    Imitator,
+    ScoreHistory,
+    Transferability,
+    discriminator_file,
+    load_cluster_model,
+    load_discriminator,
+)
+from oodil.pipeline.stage import JobContext, Run, register
+from oodil.pipeline.stages.demonstrations import load_demonstrations
+from oodil.pipeline.stages.imitators import ClusterJob, ImitatorsStage, cluster_of, load_assignment
+from oodil.pipeline.stages.weighting import Weighting
 
 
-def told_apart(config: RunConfig, scores: NDArray[np.float64], demonstrations: Demonstrations) -> dict[str, float]:
-    """Return how well (N,) scores tell the sources that are marked transferable from those that are marked not to be.
-
-    ``auroc``, and the former's share of the sampling mass: before weighting, by the scores, by their power. Empty
-    without marks of both kinds.
-    """
-    marked = transferable_mask(config, demonstrations)
-    if marked is None or not 0 < marked.sum() < len(marked):
-        return {}
-    from sklearn.metrics import roc_auc_score
-
-    weights = {
-        "transferable_share_before": np.ones(len(demonstrations)),
-        "transferable_share_unsharpened": scores,
-        "transferable_share": sharpened_weights(scores, config.transferability.sharpening),
-    }
-    shares = {name: float(sampling_mass(w, demonstrations)[marked].sum()) for name, w in weights.items()}
-    return shares | {"auroc": float(roc_auc_score(marked, scores))}
-
-
-class TransferabilityStage(Stage):
-    """A job per cluster and training, each with its own checkpoint and artifact; empty clusters have none."""
+class TransferabilityStage(Weighting):
+    """The weighting of the method: what an imitator of its own cluster can reproduce of a demonstration."""
 
     name = "transferability"
-    version = 1
-    inputs = ("demonstrations", "clustering")
+    title = "ours"
+    version = 2
+    inputs = ("demonstrations", "clustering", "imitators")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
-        """Return the section and the imitator's environment."""
-        return config.transferability.model_dump(mode="json") | {"environment": config.environment.model_dump()}
+        """Return how the discriminators are read, and how scores become weights."""
+        return self.job_settings(config) | {"sharpening": config.transferability.sharpening}
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
-        """Return what the trainings depend on; reading their scores in another way does not train again."""
-        section = config.transferability
-        return {
-            "gail": section.gail.model_dump(mode="json"),
-            "num_scores": section.num_scores,
-            "final_steps": section.final_steps,
-            "environment": config.environment.model_dump(),
-        }
+        """Return how the discriminators are read."""
+        return {"final_steps": config.transferability.final_steps}
 
     def jobs(self, run: Run) -> list[str]:
-        """Return the jobs of each cluster that has demonstrations, named by the cluster's id."""
-        clusters = [f"cluster-{k}" for k in np.unique(_labels(run))]
-        again = range(2, run.config.transferability.num_trainings + 1)
-        return clusters + [f"{cluster}-training-{n}" for n in again for cluster in clusters]
+        """Return one job per imitator, under its name."""
+        return ImitatorsStage().jobs(run)
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
-        """Imitate one cluster in the imitator's environment and score its demonstrations along the way."""
-        from oodil.pipeline.training import Probe, train
+        """Let a discriminator go on against the imitator as it is, and score the demonstrations of its cluster."""
+        from oodil.pipeline.training import experience
 
-        config, gail = run.config, run.config.transferability.gail
+        config, section = run.config, run.config.transferability
         cluster = ClusterJob.of(run, job)
-        reward, demonstrations = cluster.reward, cluster.demonstrations
-        probe = Probe("logits", config.transferability.num_scores, lambda: reward.mean_logits(demonstrations))
-        history = train(cluster.learner, config.environment, gail, [probe], context, self.checkpoints(run, job))
-        env_steps = int(history.steps("logits")[-1]) + cluster.settle(context)
-        history.append("logits", env_steps, reward.mean_logits(demonstrations))
-        discriminator = {name: value.numpy() for name, value in reward.discriminator.state_dict().items()}
-        return {
-            _JOB_FILE: encode_arrays(
-                {
-                    "demonstrations": cluster.members.astype(np.int64),
-                    "env_steps": history.steps("logits"),
-                    "logits": history.values("logits"),
-                }
-            ),
-            "discriminator.safetensors": encode_arrays(discriminator),
-            "policy.safetensors": encode_arrays(cluster.learner.behavior_policy().arrays()),
-        }
+        trained = run.job_artifact(ImitatorsStage.name, job)
+        imitator = Imitator.load(trained)
+        reward = cluster.reward(config)
+        reward.load_discriminator(imitator.discriminator)
+        horizon = environment_spec(config.environment.id, config.environment.dynamics).max_episode_steps
+        rollouts = experience(imitator.policy, config.environment, section.gail, horizon, cluster.seed, context)
+        reward.settle(rollouts, section.final_steps, section.gail.steps_per_iteration)
+        env_steps = sum(rollout.terminated.size for rollout in rollouts)
+        history = ScoreHistory.load(trained).then(env_steps, reward.mean_logits(cluster.demonstrations))
+        return history.files() | discriminator_file(reward.discriminator_arrays())
 
     def combine(self, run: Run) -> Files:
-        """Read each job's scores, turn them into weights, and say how well the sources are told apart."""
-        config = run.config
+        """Take each cluster's closest imitator and turn the scores into weights."""
         demonstrations = load_demonstrations(run)
         logits = np.full(len(demonstrations), np.nan)
-        history = {}
-        trainings: dict[int, list[dict[str, np.ndarray]]] = {}
+        history, env_steps = {}, 0
+        for cluster, jobs in self._by_cluster(run).items():
+            readings = {job: ScoreHistory.load(run.job_artifact(self.name, job)) for job in jobs}
+            env_steps += sum(int(reading.env_steps[-1] - reading.env_steps[-2]) for reading in readings.values())
+            history[cluster] = readings[_closest(readings)]
+            logits[history[cluster].demonstrations] = history[cluster].logits[-1]
+        return self._weighted(run, demonstrations, logits, load_assignment(run).labels, env_steps, history).files()
+
+    def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
+        """Return scores by the frozen clusters and discriminators, and weights among these demonstrations.
+
+        Raises DataError when the states have another dimension than those of the run.
+        """
+        from oodil.pipeline.algorithms.clustering import ClusterModel
+
+        model = ClusterModel.from_arrays(load_cluster_model(run.artifact("clustering")))
+        labels = model.label(demonstrations, run.config.clustering.label_draws, run.config.seed).labels
+        logits = np.full(len(demonstrations), np.nan)
+        by_cluster = self._by_cluster(run)
+        for cluster in np.unique(labels).tolist():
+            if cluster not in by_cluster:
+                logits[labels == cluster] = np.inf  # Nothing like it was imitated, so nothing of it is reproduced.
+                continue
+            jobs = by_cluster[cluster]
+            readings = {job: ScoreHistory.load(run.job_artifact(self.name, job)) for job in jobs}
+            job = _closest(readings)
+            reward = ClusterJob.of(run, job).reward(run.config)
+            reward.load_discriminator(load_discriminator(run.job_artifact(self.name, job)))
+            members = np.flatnonzero(labels == cluster)
+            logits[members] = reward.mean_logits(demonstrations.select(members))
+        return self._weighted(run, demonstrations, logits, labels, 0, {})
+
+    def _by_cluster(self, run: Run) -> dict[int, list[str]]:
+        """Return the jobs of each cluster that has demonstrations."""
+        jobs: dict[int, list[str]] = {}
         for job in self.jobs(run):
-            trainings.setdefault(_cluster(job), []).append(run.job_artifact(self.name, job).arrays(_JOB_FILE))
-        for cluster, trained in trainings.items():
-            # What one imitator can reproduce is transferable, whatever another made of it.
-            closest = min(trained, key=lambda arrays: float(arrays["logits"][-1].mean()))
-            logits[closest["demonstrations"]] = closest["logits"][-1]
-            history[f"cluster_{cluster}/env_steps"] = closest["env_steps"]
-            history[f"cluster_{cluster}/scores"] = transferability(closest["logits"])
-            history[f"cluster_{cluster}/demonstrations"] = closest["demonstrations"]
-        horizon = make_batch(config.environment.id, config.environment.dynamics, 1).max_episode_steps
-        scores = transferability(logits) * share_lasted(demonstrations, horizon)
-        sharpening = config.transferability.sharpening
-        weights = sharpened_weights(scores, sharpening)
-        arrays = {"scores": scores, "weights": weights, "clusters": _labels(run)}
-        summary: dict[str, Any] = {
-            "env_steps": sum(int(each["env_steps"][-1]) for trained in trainings.values() for each in trained),
-            "sharpening": sharpening,
-            "mean_score_by_source": {
-                label: float(scores[demonstrations.sources == i].mean())
-                for i, label in enumerate(demonstrations.source_labels)
-            },
-        } | told_apart(config, scores, demonstrations)
-        return {
-            "transferability.safetensors": encode_arrays(arrays),
-            "history.safetensors": encode_arrays(history),
-            "summary.json": encode_json(summary),
-        }
+            jobs.setdefault(cluster_of(job), []).append(job)
+        return jobs
+
+    def _weighted(
+        self,
+        run: Run,
+        demonstrations: Demonstrations,
+        logits: np.ndarray,
+        labels: np.ndarray,
+        env_steps: int,
+        history: dict[int, ScoreHistory],
+    ) -> Transferability:
+        environment = run.config.environment
+        horizon = environment_spec(environment.id, environment.dynamics).max_episode_steps
+        scores = transferability_of_logits(logits) * share_lasted(demonstrations, horizon)
+        weights = sharpened_weights(scores, run.config.transferability.sharpening)
+        return Transferability(scores, weights, labels, env_steps, history)
 
 
-def _cluster(job: str) -> int:
-    return int(job.split("-")[1])
-
-
-def _labels(run: Run) -> np.ndarray:
-    return run.artifact("clustering").arrays("assignment.safetensors")["labels"]
+def _closest(readings: dict[str, ScoreHistory]) -> str:
+    """Return the job whose imitator is told apart least: what one imitator can reproduce is transferable."""
+    return min(readings, key=lambda job: float(readings[job].logits[-1].mean()))
 
 
 register(TransferabilityStage())

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from oodil.pipeline.results import shown_return
+from oodil.pipeline.runs import shown_return
 from oodil.workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, JobWarning, WorkerRestarted
 
 if TYPE_CHECKING:

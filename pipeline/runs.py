@@ -1,0 +1,272 @@
+"""A run's folder as its user sees it: where every stage stands, and what the finished ones left behind, typed.
+
+A stage whose artifact is stale or damaged counts as missing here, so that figures of two different sets of
+demonstrations never meet, on a page or in a script.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodil.pipeline.algorithms.weights import sampling_mass, sharpened_weights
+from oodil.pipeline.artifacts import Artifact
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.errors import ConfigError, NotFinishedError
+from oodil.pipeline.results import (
+    Assignment,
+    ClusterDiagnostics,
+    Evaluation,
+    LearningCurve,
+    Policy,
+    TrainedImitators,
+    Transferability,
+)
+from oodil.pipeline.stage import Run, StageState, state_of
+from oodil.pipeline.stages import PolicyStage, Weighting, policies_of, stages, weightings_of
+from oodil.pipeline.stages.demonstrations import load_demonstrations, transferable_marks
+
+
+class RunResults:
+    """What a run has produced. Every getter raises NotFinishedError, with the reason, for what cannot be used."""
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+        self.states: dict[str, StageState] = {}
+        """Where each stage stands, in the order of the stages. A stage whose input is stale is stale, too."""
+        for stage in stages(run.config):
+            state = state_of(stage, run)
+            unusable = [name for name in stage.inputs if self.states[name].state in ("stale", "damaged")]
+            if state.state == "done" and unusable:
+                state = StageState("stale", f"its input {unusable[0]} is {self.states[unusable[0]].state}")
+            self.states[stage.name] = state
+
+    @property
+    def config(self) -> RunConfig:
+        """The run's configuration."""
+        return self.run.config
+
+    @property
+    def path(self) -> Path:
+        """The run's folder."""
+        return self.run.directory.path
+
+    @property
+    def policies(self) -> list[PolicyStage]:
+        """The policies that this run is meant to have, ours first."""
+        return policies_of(self.config)
+
+    @property
+    def weightings(self) -> list[Weighting]:
+        """The weightings that this run is meant to have, ours first."""
+        return weightings_of(self.config)
+
+    def is_done(self, stage: str) -> bool:
+        """Return whether a stage's artifact can be used."""
+        return stage in self.states and self.states[stage].state == "done"
+
+    def artifact(self, stage: str) -> Artifact:
+        """Return the artifact of a stage. Raises NotFinishedError unless it can be used."""
+        if stage not in self.states:
+            raise ConfigError(f"no stage {stage!r}; this run has {', '.join(self.states)}")
+        state = self.states[stage]
+        if state.artifact is None:
+            reason = f" ({state.reason})" if state.reason else ""
+            raise NotFinishedError(
+                f"{self.path}: {stage} is {state.state}{reason}; `oodil run` or `resume` computes it"
+            )
+        return state.artifact
+
+    @property
+    def demonstrations(self) -> Demonstrations:
+        """What is imitated, under the labels of the configuration."""
+        self.artifact("demonstrations")
+        return load_demonstrations(self.run)
+
+    @property
+    def assignment(self) -> Assignment:
+        """Which cluster each demonstration belongs to."""
+        return Assignment.load(self.artifact("clustering"))
+
+    @property
+    def cluster_diagnostics(self) -> ClusterDiagnostics:
+        """How good the clusters are."""
+        return ClusterDiagnostics.load(self.artifact("clustering"))
+
+    @property
+    def transferability(self) -> Transferability:
+        """What our weighting says of every demonstration."""
+        return self.weighting("transferability")
+
+    def weighting(self, name: str) -> Transferability:
+        """Return what a weighting says of every demonstration."""
+        return Transferability.load(self.artifact(name))
+
+    def policy(self, name: str = "imitation") -> Policy:
+        """Return a trained policy."""
+        return Policy.load(self.artifact(name))
+
+    def evaluation(self, name: str = "imitation") -> Evaluation:
+        """Return the final evaluation of a policy."""
+        return Evaluation.load(self.artifact(name))
+
+    def curve(self, name: str = "imitation") -> LearningCurve:
+        """Return a policy's learning curve."""
+        return LearningCurve.load(self.artifact(name))
+
+    def score(self, demonstrations: Demonstrations, weighting: str = "transferability") -> Transferability:
+        """Return what a finished weighting says of other demonstrations; nothing is trained.
+
+        Raises CannotScoreError for a weighting that cannot, and DataError when the states have another dimension.
+        """
+        self.artifact(weighting)
+        stage = next(each for each in self.weightings if each.name == weighting)
+        return stage.score(self.run, demonstrations)
+
+    def table(self, weighting: str = "transferability") -> list[dict[str, Any]]:
+        """Return one row a demonstration: number, source, states, cluster, transferability and weight."""
+        demonstrations = self.demonstrations
+        return [
+            {
+                "demonstration": row["demonstration"],
+                "source": demonstrations.source_labels[demonstrations.sources[n]],
+                "states": int(demonstrations.lengths[n]),
+                **row,
+            }
+            for n, row in enumerate(self.weighting(weighting).table())
+        ]
+
+    def marks(self) -> NDArray[np.bool_] | None:
+        """Return (N,) whether each demonstration's source is marked transferable; None unless every source is marked."""
+        marks = transferable_marks(self.config)
+        if not marks or None in marks:
+            return None
+        return np.array(marks, np.bool_)[self.demonstrations.sources]
+
+    def separation(self, weighting: str = "transferability") -> dict[str, float]:
+        """Return how well a weighting tells what is marked transferable from what is marked not to be.
+
+        ``auroc`` of the scores, and the former's share of the sampling mass: ``share_before`` weighting, ``share`` with
+        the weights and ``share_unsharpened`` with the scores as weights. Empty without marks of both kinds.
+        """
+        marks = self.marks()
+        if marks is None or not 0 < marks.sum() < len(marks):
+            return {}
+        from sklearn.metrics import roc_auc_score
+
+        found, demonstrations = self.weighting(weighting), self.demonstrations
+        weights = {
+            "share_before": np.ones(len(demonstrations)),
+            "share_unsharpened": sharpened_weights(found.scores, 1.0),
+            "share": found.weights,
+        }
+        shares = {name: float(sampling_mass(w, demonstrations)[marks].sum()) for name, w in weights.items()}
+        return {"auroc": float(roc_auc_score(marks, found.scores)), **shares}
+
+    def env_steps(self) -> dict[str, int]:
+        """Return the environment steps that each finished stage took; stages that take none are left out."""
+        steps: dict[str, int] = {}
+        for name in self.states:
+            if not self.is_done(name):
+                continue
+            if name == "imitators":
+                steps[name] = TrainedImitators.load(self.artifact(name)).env_steps
+            elif name in {weighting.name for weighting in self.weightings}:
+                steps[name] = self.weighting(name).env_steps
+            elif name in {policy.name for policy in self.policies}:
+                steps[name] = self.policy(name).env_steps
+        return {name: count for name, count in steps.items() if count}
+
+    def seconds(self) -> dict[str, float]:
+        """Return how long each finished stage took, with what was spent on it before an interruption.
+
+        A stage that is computed again counts anew, unless its jobs were reused: reading their scores in another way
+        takes no time, and says nothing of the time that they took.
+        """
+        spent: dict[str, float] = {}
+        finished: set[str] = set()
+        for event in _events(self.run):
+            stage, seconds = event.get("stage"), event.get("seconds")
+            if not isinstance(stage, str):
+                continue
+            if event.get("event") == "stage_started" and stage in finished and event.get("jobs") != 0:
+                spent[stage] = 0.0
+            if event.get("event") in ("stage_finished", "stage_interrupted") and isinstance(seconds, int | float):
+                spent[stage] = spent.get(stage, 0.0) + float(seconds)
+            if event.get("event") == "stage_finished":
+                finished.add(stage)
+        return {stage: seconds for stage, seconds in spent.items() if stage in finished}
+
+    def summary(self) -> dict[str, Any]:
+        """Return the results known so far, as JSON values.
+
+        ``policies`` by name: mean and std of the return, episodes, env_steps; ``weightings`` by name: see `separation`;
+        ``purity``; ``env_steps`` and ``seconds`` of everything that was run. What is not known is left out.
+        """
+        policies, weightings = {}, {}
+        for policy in self.policies:
+            if self.is_done(policy.name):
+                final = self.evaluation(policy.name)
+                policies[policy.name] = {
+                    "mean_return": final.mean_return if np.isfinite(final.mean_return) else None,
+                    "std_return": final.std_return if np.isfinite(final.std_return) else None,
+                    "episodes": len(final),
+                    "env_steps": self.policy(policy.name).env_steps,
+                }
+        for weighting in self.weightings:
+            if self.is_done(weighting.name) and self.is_done("demonstrations"):
+                weightings[weighting.name] = self.separation(weighting.name)
+        found: dict[str, Any] = {
+            "policies": policies,
+            "weightings": {name: figures for name, figures in weightings.items() if figures},
+            "purity": self.cluster_diagnostics.purity if self.is_done("clustering") else None,
+            "env_steps": sum(self.env_steps().values()),
+            "seconds": sum(self.seconds().values()),
+        }
+        return {name: value for name, value in found.items() if value}
+
+    def describe(self) -> dict[str, Any]:
+        """Return the state of every stage and the results known so far, as JSON values."""
+        seconds = self.seconds()
+        described = {}
+        for name, state in self.states.items():
+            entry: dict[str, Any] = {
+                "state": state.state,
+                "sha256": state.artifact.sha256 if state.artifact else None,
+            }
+            if state.reason:
+                entry["reason"] = state.reason
+            if name in seconds:
+                entry["seconds"] = round(seconds[name], 1)
+            described[name] = entry
+        return {
+            "run": str(self.path),
+            "name": self.config.name,
+            "seed": self.config.seed,
+            "stages": described,
+            "results": self.summary(),
+        }
+
+
+def shown_return(value: float) -> str:
+    """Return an episode return in the digits that it deserves."""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def _events(run: Run) -> list[dict[str, Any]]:
+    try:
+        lines = run.directory.events.read_text(encoding="utf-8", errors="replace").splitlines()
+    except FileNotFoundError:
+        return []
+    events = []
+    for line in lines:
+        try:
+            event = json.loads(line)
+        except ValueError:  # a line cut short by a kill
+            continue
+        if isinstance(event, dict):
+            events.append(event)
+    return events

@@ -1,0 +1,97 @@
+"""Stage 5: a policy, by GAIL on weighted demonstrations (Eqn 7 and 8); policies differ in their weightings alone."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodil.pipeline.artifacts import Files
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.environments import environment_spec
+from oodil.pipeline.evaluation import evaluate
+from oodil.pipeline.results import LearningCurve, Policy, discriminator_file
+from oodil.pipeline.seeding import derive_key, torch_seed
+from oodil.pipeline.stage import JobContext, Run, Stage, register, stage_named
+from oodil.pipeline.stages.demonstrations import load_demonstrations
+from oodil.pipeline.stages.weighting import Weighting
+
+
+class PolicyStage(Stage):
+    """Weighted GAIL under a name: one learner fed by rollout workers.
+
+    A competing method is an instance with a weighting of its own, registered beside it.
+    """
+
+    version = 2
+    distributed = True
+
+    def __init__(self, name: str, title: str, weighting: str | None) -> None:
+        """Name a policy.
+
+        Args:
+            name: of the stage, the policy and its folder.
+            title: what it is called in tables and figures.
+            weighting: the stage that weighs the demonstrations; without one all weigh the same.
+        """
+        self.name = name
+        self.title = title
+        self.weighting = weighting
+        self.inputs = ("demonstrations",) if weighting is None else ("demonstrations", weighting)
+
+    @property
+    def module(self) -> str:
+        """The module that registers its weighting; one without a weighting is registered here."""
+        return super().module if self.weighting is None else stage_named(self.weighting).module
+
+    def settings(self, config: RunConfig) -> dict[str, Any]:
+        """Return the section and the imitator's environment."""
+        return config.imitation.model_dump(mode="json") | {"environment": config.environment.model_dump()}
+
+    def weights(self, run: Run) -> NDArray[np.float64]:
+        """Return (N,) weights of the demonstrations."""
+        if self.weighting is None:
+            return np.ones(len(load_demonstrations(run)))
+        weighting = stage_named(self.weighting)
+        assert isinstance(weighting, Weighting)
+        return weighting.load(run).weights
+
+    def run_job(self, run: Run, job: str, context: JobContext) -> Files:
+        """Train the policy and evaluate it with its mean action."""
+        from oodil.pipeline.algorithms.gail import AdversarialReward
+        from oodil.pipeline.algorithms.learner import Learner
+        from oodil.pipeline.training import Probe, train
+
+        config, evaluation = run.config, run.config.evaluation
+        environment, gail = config.environment, config.imitation.gail
+        spec = environment_spec(environment.id, environment.dynamics)
+        # The same seed for all policies: they differ in their weights alone.
+        seed = torch_seed(derive_key(config.seed, "imitation"))
+        reward = AdversarialReward(load_demonstrations(run), self.weights(run), gail.discriminator, seed)
+        learner = Learner(spec.observation_dim, spec.action_dim, gail, reward, seed)
+
+        def curve_point() -> NDArray[np.float64]:
+            policy, key = learner.behavior_policy(), derive_key(config.seed, "curve")
+            seen = evaluate(policy, environment.id, environment.dynamics, evaluation.episodes, key)
+            return np.array([seen.mean_return, seen.std_return, seen.mean_length])
+
+        probe = Probe("curve", evaluation.num_points, curve_point)
+        history = train(learner, environment, gail, [probe], context, self.checkpoints(run, job))
+        policy = Policy(
+            gaussian=learner.behavior_policy(),
+            environment_id=environment.id,
+            observation_shape=spec.observation_shape,
+            action_low=spec.action_low,
+            action_high=spec.action_high,
+            env_steps=gail.num_iterations * gail.steps_per_iteration,
+        )
+        mean, std, length = history.values("curve").reshape(-1, 3).T
+        curve = LearningCurve(history.steps("curve"), mean, std, length, evaluation.episodes)
+        key = derive_key(config.seed, "final")
+        final = evaluate(policy.gaussian, environment.id, environment.dynamics, evaluation.final_episodes, key)
+        discriminator = discriminator_file(reward.discriminator_arrays())
+        return policy.files() | discriminator | curve.files() | final.files()
+
+
+register(PolicyStage("imitation", title="ours", weighting="transferability"))
+register(PolicyStage("naive_gail", title="naive GAIL", weighting=None))
+register(PolicyStage("oracle", title="oracle", weighting="marks"))

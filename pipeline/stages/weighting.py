@@ -1,0 +1,30 @@
+"""The contract of a weighting: a stage that gives every demonstration a score and a weight."""
+
+from abc import abstractmethod
+
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.errors import OodilError
+from oodil.pipeline.results import Transferability
+from oodil.pipeline.stage import Run, Stage
+
+
+class Weighting(Stage):
+    """A stage whose artifact is a `Transferability`; a policy learns from demonstrations as it weighs them."""
+
+    title: str
+    """What it is called in tables and figures."""
+
+    def load(self, run: Run) -> Transferability:
+        """Return what it says of the run's demonstrations. Raises NotFinishedError."""
+        return Transferability.load(run.artifact(self.name))
+
+    @abstractmethod
+    def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
+        """Return what it says of other demonstrations, from its finished artifact alone: nothing is trained.
+
+        Raises `CannotScoreError` for a weighting that knows nothing of demonstrations it was not made with.
+        """
+
+
+class CannotScoreError(OodilError):
+    """A weighting that cannot score demonstrations which were not part of its run."""
