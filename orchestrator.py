@@ -1,45 +1,67 @@
-"""The run: its folder, and the walk over the stages that reuses, resumes or computes each.
+"""The run: its folder, and the stages in order, each reused, resumed or computed.
 
-Stages say what is computed, an engine says where; here it is only decided what has to be done.
+Stages say what is computed, an engine says where; here it is only decided what has to be done. Nothing is printed and
+no signal is handled here: an observer is told what happens, and a function is asked whether to stop.
 """
 
 import fcntl
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from oodil.pipeline.artifacts import Artifact, RunDirectory, read_artifact, remove_artifact, write_artifact, write_file
+from oodil.pipeline.artifacts import RunDirectory, read_artifact, remove_artifact, write_artifact, write_file
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.environments import check_environment
-from oodil.pipeline.errors import ConfigError, DamagedArtifactError, OodilError
+from oodil.pipeline.errors import ConfigError, DamagedArtifactError, OodilError, StorageError
 from oodil.pipeline.loading import parse_config
-from oodil.pipeline.results import Results, summary
-from oodil.pipeline.stage import Run, Stage, is_current
+from oodil.pipeline.stage import Run, Stage, state_of
 from oodil.pipeline.stages import stages
 from oodil.pipeline.stages.demonstrations import check_demonstrations
 from oodil.pipeline.versions import library_versions
-from oodil.terminal import Display, stop_flag
-from oodil.workers.engine import Engine, Outcome
+from oodil.workers.engine import Engine, Event, Outcome
+
+
+class Observer:
+    """Whoever is told how a run goes; this one keeps silent. All calls come from the thread of `execute`."""
+
+    def stage_reused(self, stage: str) -> None:
+        """A finished stage is taken as it is."""
+
+    def stage_started(self, stage: str, reason: str, jobs: int) -> None:
+        """A stage begins with this many jobs; the reason says why it is computed again or goes on."""
+
+    def stage_finished(self, stage: str, seconds: float) -> None:
+        """A stage is done."""
+
+    def event(self, event: Event) -> None:
+        """An engine reports on a job."""
 
 
 class UnfinishedError(OodilError):
     """A stage failed or was stopped; what was finished is kept."""
 
-    def __init__(self, stage: str, outcome: Outcome) -> None:
-        super().__init__(stage)
+    def __init__(self, run: Run, stage: str, outcome: Outcome) -> None:
+        failures = "".join(f"{stage}/{job} failed:\n{traceback}\n\n" for job, traceback in outcome.failed.items())
+        super().__init__(
+            f"{failures}{stage}: {len(outcome.done)} jobs done, {len(outcome.failed)} failed, "
+            f"{len(outcome.not_run)} not finished. What is finished is kept; go on with: "
+            f"oodil resume {run.directory.path}"
+        )
         self.stage = stage
         self.outcome = outcome
 
 
-def open_run(path: Path, config: RunConfig) -> Run:
+def open_run(path: Path, config: RunConfig, force: Collection[str] = ()) -> Run:
     """Create a run's folder, or accept one of the same run, and write the resolved configuration into it.
 
-    Raises ConfigError when the folder holds something else.
+    Raises ConfigError, and leaves the folder as it is, when it holds something else, or a finished stage of other
+    settings that is not to be replaced (``force`` names those that are; what follows from them is replaced, too).
     """
     directory = RunDirectory(path)
+    run = Run(config, directory)
     if directory.config.exists():
         held = read_run(path).config
         for field in ("name", "seed", "environment"):
@@ -48,11 +70,15 @@ def open_run(path: Path, config: RunConfig) -> Run:
                 raise ConfigError(
                     f"{path}: holds a run with {field} {_short(old)}, not {_short(new)}; choose another --run-dir"
                 )
+        refuse_to_replace(run, force)
     elif path.exists() and any(path.iterdir()):
         raise ConfigError(f"{path}: is not empty and not a run; choose another --run-dir")
-    path.mkdir(parents=True, exist_ok=True)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"{path}: {error.strerror or error}") from error
     write_file(directory.config, (config.model_dump_json(indent=2) + "\n").encode())
-    return Run(config, directory)
+    return run
 
 
 def read_run(path: Path) -> Run:
@@ -60,65 +86,105 @@ def read_run(path: Path) -> Run:
     directory = RunDirectory(path)
     if not directory.config.is_file():
         raise ConfigError(f"{path}: is not a run (it has no {directory.config.name})")
-    return Run(parse_config(json.loads(directory.config.read_text()), str(directory.config)), directory)
+    try:
+        values = json.loads(directory.config.read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{directory.config}: cannot be read ({error})") from error
+    return Run(parse_config(values, str(directory.config)), directory)
+
+
+def refuse_to_replace(run: Run, force: Collection[str]) -> None:
+    """Raise ConfigError if a finished stage was made by other code or with other settings and is not in ``force``.
+
+    A stage whose input was replaced follows its input and needs no word of its own.
+    """
+    chosen = stages(run.config)
+    for name in force:
+        choose(run.config, until=name)
+    replaced = set(force)
+    for stage in chosen:
+        if replaced.intersection(stage.inputs):
+            replaced.add(stage.name)
+        elif stage.name not in replaced:
+            state = state_of(stage, run)
+            if state.state == "stale" and not state.reason.startswith("its input"):
+                raise ConfigError(
+                    f"{run.directory.path}: {stage.name} is finished with other settings ({state.reason}); "
+                    f"--force {stage.name} replaces it and what follows from it, another --run-dir keeps both"
+                )
 
 
 def check_inputs(config: RunConfig) -> None:
     """Refuse, before any work, an environment that cannot be made and demonstrations that cannot fit it."""
-    simulators = check_environment(config.environment.id, config.environment.dynamics)
+    spec = check_environment(config.environment.id, config.environment.dynamics)
     for name in ("transferability", "imitation"):
         ignored = getattr(config, name).gail.discriminator.ignored
-        if not set(ignored) < set(range(simulators.observation_dim)):
+        if not set(ignored) < set(range(spec.observation_dim)):
             raise ConfigError(
                 f"{name}.gail.discriminator.ignored is {list(ignored)}; states have the dimensions 0 to "
-                f"{simulators.observation_dim - 1}, of which at least one must be seen"
+                f"{spec.observation_dim - 1}, of which at least one must be seen"
             )
     for source in config.demonstrations.sources:
         check_environment(config.environment.id, source.dynamics)
-    check_demonstrations(config, simulators.observation_dim)
+    check_demonstrations(config, spec.observation_dim)
 
 
-def walk(run: Run, chosen: list[Stage], engine: Engine, force: str | None = None) -> None:
-    """Bring every chosen stage to its finished artifact. Raises UnfinishedError where that ends early."""
-    with _lock(run.directory), Display() as display, stop_flag(display.stopping) as should_stop:
+def choose(config: RunConfig, until: str | None = None) -> list[Stage]:
+    """Return the stages of a run up to one of them, or all. Raises ConfigError, naming those there are."""
+    chosen = stages(config)
+    names = [stage.name for stage in chosen]
+    if until is not None and until not in names:
+        raise ConfigError(f"no stage {until!r}; this run has {', '.join(names)}")
+    return chosen[: names.index(until) + 1] if until else chosen
+
+
+def execute(
+    run: Run,
+    chosen: Sequence[Stage],
+    engine: Engine,
+    observer: Observer | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    force: Collection[str] = (),
+) -> None:
+    """Bring every chosen stage to its finished artifact; those in ``force`` are computed again.
+
+    Raises UnfinishedError where that ends early, and ConfigError if another process works on the run.
+    """
+    observer = observer or Observer()
+    with _lock(run.directory):
         _record(run.directory, "run_started", engine=str(engine), versions=library_versions())
         for stage in chosen:
-            _bring_up(stage, run, engine, force == stage.name, display, should_stop)
+            _execute_stage(stage, run, engine, observer, should_stop, stage.name in force)
         _record(run.directory, "run_finished")
 
 
-def _bring_up(
-    stage: Stage,
-    run: Run,
-    engine: Engine,
-    forced: bool,
-    display: Display,
-    should_stop: Callable[[], bool],
+def _execute_stage(
+    stage: Stage, run: Run, engine: Engine, observer: Observer, should_stop: Callable[[], bool], forced: bool
 ) -> None:
-    origin, path = stage.origin(run), run.directory.stage(stage.name)
-    found, reason = _inspect(path, origin)
-    if found is not None and not forced:
-        display.reused(stage.name)
+    state = state_of(stage, run)
+    if state.state == "done" and not forced:
+        observer.stage_reused(stage.name)
         return
     started = time.monotonic()
+    reason = f"recomputed: {state.reason}" if state.state in ("stale", "damaged") else ""
     pending = _pending(stage, run, forced)
     resumed = [job for job in pending if stage.checkpoints(run, job).exist()]
     if forced:
         reason = "computed again as asked"
     elif resumed:
         reason = "resumed from checkpoint" + ("" if resumed == [stage.name] else f" ({', '.join(resumed)})")
-    display.stage_started(stage.name, reason, len(pending))
+    observer.stage_started(stage.name, reason, len(pending))
     _record(run.directory, "stage_started", stage=stage.name, reason=reason, jobs=len(pending))
-    outcome = engine.run_jobs(stage, run, pending, display.event, should_stop)
+    outcome = engine.run_jobs(stage, run, pending, observer.event, should_stop)
     if outcome.stopped or outcome.failed:
         _record(run.directory, "stage_interrupted", stage=stage.name, seconds=time.monotonic() - started)
-        raise UnfinishedError(stage.name, outcome)
+        raise UnfinishedError(run, stage.name, outcome)
     files = stage.combine(run)
     if files is not None:
-        write_artifact(path, origin, files, library_versions())
+        write_artifact(run.directory.stage(stage.name), stage.origin(run), files, library_versions())
     seconds = time.monotonic() - started
     _record(run.directory, "stage_finished", stage=stage.name, seconds=seconds)
-    display.stage_finished(stage.name, seconds)
+    observer.stage_finished(stage.name, seconds)
 
 
 def _pending(stage: Stage, run: Run, forced: bool) -> list[str]:
@@ -128,70 +194,32 @@ def _pending(stage: Stage, run: Run, forced: bool) -> list[str]:
         path = run.directory.job(stage.name, job)
         if forced:
             stage.checkpoints(run, job).clear()
-        if forced or _inspect(path, stage.job_origin(run, job))[0] is None:
+        if forced or not _is_current(path, stage.job_origin(run, job)):
             remove_artifact(path)
             pending.append(job)
     return pending
 
 
-def _inspect(path: Path, origin: dict[str, Any]) -> tuple[Artifact | None, str]:
-    """Return a current, undamaged artifact, or None and the reason to compute it."""
+def _is_current(path: Path, origin: dict[str, Any]) -> bool:
+    """Return whether an undamaged artifact of this origin lies at ``path``."""
     try:
         artifact = read_artifact(path)
-        if artifact is None:
-            return None, ""
-        if not is_current(artifact, origin):
-            return None, f"recomputed: {_difference(artifact.origin, origin)}"
+        if artifact is None or not artifact.made_from(origin):
+            return False
         artifact.verify()
-    except DamagedArtifactError as error:
-        return None, f"recomputed: {error}"
-    return artifact, ""
-
-
-def _difference(old: Any, new: Any, key: str = "") -> str:
-    """Name the first place where two origins differ, as ``key old -> new``."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        for name in sorted({*old, *new}):
-            if old.get(name) != new.get(name):
-                return _difference(old.get(name), new.get(name), f"{key}.{name}" if key else name)
-    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
-        for i, (a, b) in enumerate(zip(old, new, strict=True)):
-            if a != b:
-                return _difference(a, b, f"{key}[{i}]")
-    if key.startswith("inputs."):
-        return f"its input {key.removeprefix('inputs.')} changed"
-    return f"{key.removeprefix('settings.')} {old!r} -> {new!r}"
-
-
-def describe(run: Run) -> dict[str, Any]:
-    """Return the state of every stage and the results known so far, as JSON values."""
-    seconds = Results(run).seconds()
-    described = {}
-    for stage in stages(run.config):
-        entry: dict[str, Any] = {"state": "pending", "sha256": None}
-        try:
-            artifact = read_artifact(run.directory.stage(stage.name))
-            if artifact is not None:
-                artifact.verify()
-                entry = {"state": "done", "sha256": artifact.sha256}
-            elif run.directory.has_begun(stage.name):
-                entry["state"] = "partial"
-        except DamagedArtifactError as error:
-            entry = {"state": "damaged", "sha256": None, "reason": str(error)}
-        described[stage.name] = entry | ({"seconds": round(seconds[stage.name], 1)} if stage.name in seconds else {})
-    return {
-        "run": str(run.directory.path),
-        "name": run.config.name,
-        "seed": run.config.seed,
-        "stages": described,
-        "results": summary(run),
-    }
+    except DamagedArtifactError:
+        return False
+    return True
 
 
 @contextmanager
 def _lock(directory: RunDirectory) -> Iterator[None]:
     """Hold the run for this process; the lock goes with the process, however it ends."""
-    with open(directory.path / ".lock", "w") as file:
+    try:
+        file = open(directory.path / ".lock", "w")  # noqa: SIM115 (closed below, after what it protects)
+    except OSError as error:
+        raise StorageError(f"{directory.path}: {error.strerror or error}") from error
+    with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -201,8 +229,11 @@ def _lock(directory: RunDirectory) -> Iterator[None]:
 
 def _record(directory: RunDirectory, event: str, **fields: Any) -> None:
     """Append to the run's log, the place for times, worker counts and everything else that varies."""
-    with open(directory.events, "a") as file:
-        file.write(json.dumps({"time": time.time(), "event": event, **fields}) + "\n")
+    try:
+        with open(directory.events, "a") as file:
+            file.write(json.dumps({"time": time.time(), "event": event, **fields}) + "\n")
+    except OSError as error:
+        raise StorageError(f"{directory.events}: {error.strerror or error}") from error
 
 
 def _short(value: Any) -> str:

@@ -60,7 +60,7 @@ def main() -> None:
         # The budget has no end; the run is stopped when the time is over.
         command = [sys.executable, str(ROOT / "orchestrator.py"), "run", str(ROOT / "configs" / "smoke.yaml")]
         command += ["imitation.gail.total_steps=1_000_000_000", "baselines=[]", "--workers", "2"]
-        command += ["imitation.gail.num_evaluations=1000", "--run-dir", str(Path(folder) / "run")]
+        command += ["evaluation.num_points=1000", "--run-dir", str(Path(folder) / "run")]
         run = psutil.Popen(command, stdout=subprocess.DEVNULL)
         while not (Path(folder) / "run" / "logs" / "imitation-imitation.1.log").exists():
             time.sleep(1)

@@ -18,7 +18,7 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from oodil.pipeline.errors import DamagedArtifactError
+from oodil.pipeline.errors import DamagedArtifactError, StorageError
 
 MANIFEST = "manifest.json"
 KEPT_CHECKPOINTS = 2
@@ -72,6 +72,10 @@ class Artifact:
         """One hash over the hashes of all files: equal content, equal hash."""
         return fingerprint(self.hashes)
 
+    def made_from(self, origin: dict[str, Any]) -> bool:
+        """Return whether it was made from exactly this origin."""
+        return self.fingerprint == fingerprint(origin)
+
     def read(self, name: str) -> bytes:
         """Return the bytes of a file. Raises DamagedArtifactError unless they are those that were written."""
         path = self.path / name
@@ -102,17 +106,33 @@ def write_artifact(
 ) -> Artifact:
     """Write a finished artifact at ``path`` atomically, replacing any other there.
 
-    Raises OSError when the disk does not take it; whatever stood at ``path`` then stands as before.
+    Raises StorageError when the disk does not take it; an existing artifact is then left unchanged.
     """
+    try:
+        _write_folder(path, _with_manifest(origin, files, versions or {}))
+    except OSError as error:
+        raise StorageError(f"{path}: {error.strerror or error}") from error
+    written = read_artifact(path)
+    assert written is not None
+    return written
+
+
+def _with_manifest(origin: dict[str, Any], files: Files, versions: dict[str, str]) -> Files:
+    """Return the files and, last, the manifest that lists them."""
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in sorted(files.items())}
-    manifest = {"fingerprint": fingerprint(origin), "origin": origin, "versions": versions or {}, "files": hashes}
+    manifest = {"fingerprint": fingerprint(origin), "origin": origin, "versions": versions, "files": hashes}
+    return files | {MANIFEST: encode_json(manifest)}
+
+
+def _write_folder(path: Path, files: Files) -> None:
+    """Write a folder under a temporary name, flush it and put it in the place of ``path``."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.parent / f".{path.name}.new"
     replaced = path.parent / f".{path.name}.old"
     try:
         _remove(temporary)
         temporary.mkdir()
-        for name, content in (*files.items(), (MANIFEST, encode_json(manifest))):
+        for name, content in files.items():
             with open(temporary / name, "wb") as file:
                 file.write(content)
                 file.flush()
@@ -128,19 +148,19 @@ def write_artifact(
         if replaced.exists() and not path.exists():
             replaced.rename(path)
     _remove(replaced)
-    written = read_artifact(path)
-    assert written is not None
-    return written
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Replace one file atomically; for files of a run that are no artifact."""
+    """Replace one file atomically; for files of a run that are no artifact. Raises StorageError."""
     temporary = path.with_name(f".{path.name}.new")
-    with open(temporary, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        raise StorageError(f"{path}: {error.strerror or error}") from error
 
 
 def read_artifact(path: Path) -> Artifact | None:
@@ -201,7 +221,7 @@ class Checkpoints:
         for path in reversed(self._paths()):
             try:
                 checkpoint = read_artifact(path)
-                if checkpoint is not None and checkpoint.fingerprint == fingerprint(self.origin):
+                if checkpoint is not None and checkpoint.made_from(self.origin):
                     return checkpoint.arrays("state.safetensors"), warnings
             except (DamagedArtifactError, safetensors.SafetensorError) as error:
                 warnings.append(f"checkpoint ignored: {error}")
@@ -220,7 +240,7 @@ class Checkpoints:
             checkpoint = read_artifact(path)
         except DamagedArtifactError:
             return False
-        return checkpoint is not None and checkpoint.fingerprint == fingerprint(self.origin)
+        return checkpoint is not None and checkpoint.made_from(self.origin)
 
     def _paths(self) -> list[Path]:
         return sorted(p for p in self.folder.glob("[0-9]*") if p.is_dir()) if self.folder.exists() else []

@@ -16,7 +16,7 @@ from oodil.pipeline.data import Episode
 from oodil.pipeline.environments import Simulators, make_batch
 from oodil.pipeline.errors import UnusableEnvironmentError
 from oodil.pipeline.policy import Controller, GaussianPolicy
-from oodil.pipeline.results import Evaluation
+from oodil.pipeline.results import Evaluation, Policy
 from oodil.pipeline.seeding import Key, numpy_rng
 
 FRAMES_PER_SECOND = 30
@@ -61,7 +61,7 @@ def evaluate(
     return Evaluation(np.array([e.env_return for e in seen]), np.array([len(e.states) - 1 for e in seen]))
 
 
-def film(policy: GaussianPolicy, env_id: str, dynamics: Mapping[str, float], seed: int, path: Path) -> float:
+def film(policy: Policy, env_id: str, dynamics: Mapping[str, float], seed: int, path: Path) -> float:
     """Film one deterministic episode as MP4 and return its true return.
 
     Raises UnusableEnvironmentError when nothing can be rendered here, with what is missing.
@@ -81,7 +81,7 @@ def film(policy: GaussianPolicy, env_id: str, dynamics: Mapping[str, float], see
         while not ended:
             if step % every == 0:
                 frames.append(env.render())
-            observation, reward, terminated, truncated, _ = env.step(policy.mean(observation[None])[0])
+            observation, reward, terminated, truncated, _ = env.step(policy.act(np.asarray(observation)))
             env_return, ended, step = env_return + float(reward), terminated or truncated, step + 1
         fps = env.metadata["render_fps"] / every
         env.close()

@@ -140,7 +140,7 @@ class RunResults:
         ]
 
     def marks(self) -> NDArray[np.bool_] | None:
-        """Return (N,) whether each demonstration's source is marked transferable; None unless every source is marked."""
+        """Return (N,) whether each demonstration's source is marked transferable; None unless all are marked."""
         marks = transferable_marks(self.config)
         if not marks or None in marks:
             return None

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
-from oodil.pipeline.artifacts import Artifact, Checkpoints, Files, RunDirectory, fingerprint, read_artifact
+from oodil.pipeline.artifacts import Artifact, Checkpoints, Files, RunDirectory, read_artifact
 from oodil.pipeline.collecting import RolloutSource
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.errors import ConfigError, DamagedArtifactError, NotFinishedError
@@ -73,7 +73,7 @@ class Stage(ABC):
         """The module that registers it; a process imports it before it runs a job of the stage."""
         return type(self).__module__
 
-    def check(self, config: RunConfig) -> None:
+    def check(self, config: RunConfig) -> None:  # noqa: B027 (most stages can always run)
         """Raise ConfigError, before any work, for a configuration in which this stage cannot run."""
 
     @abstractmethod
@@ -165,7 +165,7 @@ def state_of(stage: Stage, run: Run) -> StageState:
         if missing:
             return StageState("stale", f"its input {missing[0]} is missing")
         origin = stage.origin(run)
-        if artifact.fingerprint != fingerprint(origin):
+        if not artifact.made_from(origin):
             return StageState("stale", origin_difference(artifact.origin, origin))
         artifact.verify()
     except DamagedArtifactError as error:

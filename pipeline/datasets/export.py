@@ -1,29 +1,37 @@
 """What a run found out about each demonstration, written to where the demonstrations came from, or to a table."""
 
 import csv
+import io
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
+from oodil.pipeline.artifacts import write_file
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.datasets import minari, robomimic
 from oodil.pipeline.errors import DataError
+from oodil.pipeline.results import Transferability
 
 TARGETS = "FILE.csv (a new table), FILE.hdf5 (masks and attributes) or minari:DATASET_ID (episode metadata)"
 
 
-def export(demonstrations: Demonstrations, found: dict[str, NDArray[Any]], target: str) -> str:
+def export(demonstrations: Demonstrations, transferability: Transferability, target: str) -> str:
     """Write cluster, transferability and weight of (N,) demonstrations and return what was done.
 
     Args:
         demonstrations: those of the run; an existing target must hold exactly these.
-        found: ``cluster`` int, ``transferability`` and ``weight`` float, (N,) each.
+        transferability: what the run says of them.
         target: one of `TARGETS`.
 
     Raises DataError.
     """
     path = Path(target)
+    found: dict[str, NDArray[Any]] = {
+        "cluster": transferability.clusters,
+        "transferability": transferability.scores,
+        "weight": transferability.weights,
+    }
     try:
         if target.startswith("minari:"):
             minari.write_metadata(target.removeprefix("minari:"), demonstrations, found)
@@ -35,10 +43,11 @@ def export(demonstrations: Demonstrations, found: dict[str, NDArray[Any]], targe
         raise DataError(f"{target}: needs {error.name}; pip install 'oodil[data]'") from error
     if path.suffix != ".csv":
         raise DataError(f"{target}: unknown format; give {TARGETS}")
-    with open(path, "w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["demonstration", "source", "states", *found])
-        for n, length in enumerate(demonstrations.lengths.tolist()):
-            source = demonstrations.source_labels[demonstrations.sources[n]]
-            table.writerow([n, source, length, *(column[n].item() for column in found.values())])
+    text = io.StringIO(newline="")
+    table = csv.writer(text)
+    table.writerow(["demonstration", "source", "states", *found])
+    for n, length in enumerate(demonstrations.lengths.tolist()):
+        source = demonstrations.source_labels[demonstrations.sources[n]]
+        table.writerow([n, source, length, *(column[n].item() for column in found.values())])
+    write_file(path, text.getvalue().encode())
     return f"{path}: {len(demonstrations)} rows"

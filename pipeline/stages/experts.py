@@ -89,7 +89,7 @@ class ExpertsStage(Stage):
     def combine(self, run: Run) -> Files:
         """Choose the better training of each source."""
         chosen = {}
-        for i, source in self._trained(run):
+        for i, _ in self._trained(run):
             returns = {
                 job: run.job_artifact(self.name, job).json("expert.json")["stochastic"]["return_mean"]
                 for job in self.jobs(run)

@@ -1,1 +1,96 @@
-"""Imitation learning from demonstrators whose dynamics differ from your own robot's."""
+"""Imitation learning from demonstrators whose dynamics differ from your own robot's.
+
+The public interface; everything is loaded when it is first used, so that ``import oodil`` takes no time:
+
+>>> import oodil
+>>> results = oodil.run("quickstart", workers=2)  # doctest: +SKIP
+>>> results.transferability.table()  # doctest: +SKIP
+>>> action = results.policy().act(observation)  # doctest: +SKIP
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from oodil.api import evaluate, open_run, run
+    from oodil.orchestrator import Observer, UnfinishedError
+    from oodil.pipeline.config import RunConfig
+    from oodil.pipeline.data import Demonstrations
+    from oodil.pipeline.datasets import read_demonstrations
+    from oodil.pipeline.errors import OodilError
+    from oodil.pipeline.loading import load_config, shipped_configs
+    from oodil.pipeline.report import write_report
+    from oodil.pipeline.results import (
+        Assignment,
+        ClusterDiagnostics,
+        Evaluation,
+        LearningCurve,
+        Policy,
+        Transferability,
+    )
+    from oodil.pipeline.runs import RunResults
+    from oodil.pipeline.stage import register
+    from oodil.pipeline.stages import PolicyStage, Weighting
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Assignment",
+    "ClusterDiagnostics",
+    "Demonstrations",
+    "Evaluation",
+    "LearningCurve",
+    "Observer",
+    "OodilError",
+    "Policy",
+    "PolicyStage",
+    "RunConfig",
+    "RunResults",
+    "Transferability",
+    "UnfinishedError",
+    "Weighting",
+    "evaluate",
+    "load_config",
+    "open_run",
+    "read_demonstrations",
+    "register",
+    "run",
+    "shipped_configs",
+    "write_report",
+]
+
+_HOMES = {
+    "oodil.api": ("evaluate", "open_run", "run"),
+    "oodil.orchestrator": ("Observer", "UnfinishedError"),
+    "oodil.pipeline.config": ("RunConfig",),
+    "oodil.pipeline.data": ("Demonstrations",),
+    "oodil.pipeline.datasets": ("read_demonstrations",),
+    "oodil.pipeline.errors": ("OodilError",),
+    "oodil.pipeline.loading": ("load_config", "shipped_configs"),
+    "oodil.pipeline.report": ("write_report",),
+    "oodil.pipeline.results": (
+        "Assignment",
+        "ClusterDiagnostics",
+        "Evaluation",
+        "LearningCurve",
+        "Policy",
+        "Transferability",
+    ),
+    "oodil.pipeline.runs": ("RunResults",),
+    "oodil.pipeline.stage": ("register",),
+    "oodil.pipeline.stages": ("PolicyStage", "Weighting"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name when it is first used."""
+    for module, names in _HOMES.items():
+        if name in names:
+            value = globals()[name] = getattr(import_module(module), name)
+            return value
+    raise AttributeError(f"module 'oodil' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """List what is public."""
+    return sorted([*__all__, "__version__"])

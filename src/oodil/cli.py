@@ -5,15 +5,14 @@ No mathematics and no sockets. Heavy imports follow argument parsing, so that ``
 
 import json
 import os
+import shutil
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from oodil.pipeline.errors import ConfigError, OodilError
+from oodil.pipeline.errors import ConfigError, OodilError, StorageError
 
 if TYPE_CHECKING:
     from oodil.pipeline.config import RunConfig
@@ -26,8 +25,27 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_STOPPED = 1, 2, 130
 
+
+class _Commands(typer.core.TyperGroup):
+    """Ends every command in the same way: what a user can mend is one message, and a defect keeps its traceback."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command."""
+        from oodil.orchestrator import UnfinishedError
+
+        try:
+            return super().invoke(ctx)
+        except UnfinishedError as error:
+            print(f"\n{error}", file=sys.stderr)
+            raise typer.Exit(EXIT_FAILED if error.outcome.failed else EXIT_STOPPED) from None
+        except OodilError as error:
+            print(f"oodil: {error}", file=sys.stderr)
+            raise typer.Exit(EXIT_BAD_INPUT) from None
+
+
 app = typer.Typer(
     name="oodil",
+    cls=_Commands,
     help="Imitation learning from demonstrators whose dynamics differ from your robot's.",
     no_args_is_help=True,
     add_completion=False,
@@ -38,12 +56,16 @@ app.add_typer(demos_app, name="demos")
 keys_app = typer.Typer(help="Keys for rollout workers on other machines.", no_args_is_help=True)
 app.add_typer(keys_app, name="keys")
 
-ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="A YAML file; configs/ has examples.")]
+ConfigSource = Annotated[
+    str, typer.Argument(metavar="CONFIG", help="A YAML file, or the name of a configuration (`oodil configs`).")
+]
 Overrides = Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Fields to override.")]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN_DIR", help="The folder of a run.")]
 Workers = Annotated[int | None, typer.Option("--workers", "-w", min=0, help="Parallel processes; 0 runs inline.")]
-Until = Annotated[str | None, typer.Option(help="Stop after this stage.")]
-Force = Annotated[str | None, typer.Option(help="Compute this stage again although it is finished.")]
+Until = Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")]
+Force = Annotated[
+    list[str] | None, typer.Option(metavar="STAGE", help="Compute a finished stage again; can be repeated.")
+]
 Bind = Annotated[str | None, typer.Option(help="Let workers of other machines join here, e.g. tcp://0.0.0.0:5555.")]
 Keys = Annotated[Path | None, typer.Option(help="Folder of keys, made by `oodil keys new`; --bind needs it.")]
 EngineName = Annotated[Literal["local", "ray"], typer.Option(help="This machine's processes, or a Ray cluster.")]
@@ -52,7 +74,7 @@ TrustCluster = Annotated[bool, typer.Option("--trust-cluster", help="Use a Ray c
 
 @app.command()
 def run(
-    config_path: ConfigPath,
+    config_source: ConfigSource,
     overrides: Overrides = None,
     workers: Workers = None,
     run_dir: Annotated[Path | None, typer.Option(help="Default: runs/NAME-seedSEED.")] = None,
@@ -64,16 +86,15 @@ def run(
     trust_cluster: TrustCluster = False,
 ) -> None:
     """Run the pipeline; what is already finished is reused, what was interrupted goes on."""
-    with _bad_input():
-        from oodil.pipeline.loading import load_config
+    from oodil.api import default_folder
+    from oodil.orchestrator import check_inputs, choose, open_run
+    from oodil.pipeline.loading import load_config
 
-        config = load_config(config_path, overrides)
-        from oodil.orchestrator import check_inputs, open_run
-
-        check_inputs(config)
-        chosen = _engine(config, engine, workers, bind, keys, trust_cluster)
-        opened = open_run(run_dir or Path("runs") / f"{config.name}-seed{config.seed}", config)
-    _execute(opened, chosen, until, force)
+    config = load_config(config_source, overrides)
+    check_inputs(config)
+    chosen = choose(config, until)
+    where = _engine(config, engine, workers, bind, keys, trust_cluster)
+    _execute(open_run(run_dir or default_folder(config), config, force or ()), chosen, where, force)
 
 
 @app.command()
@@ -88,13 +109,36 @@ def resume(
     trust_cluster: TrustCluster = False,
 ) -> None:
     """Go on with an interrupted run, with any number of workers or on another engine."""
-    from oodil.orchestrator import check_inputs, read_run
+    from oodil.orchestrator import check_inputs, choose, read_run, refuse_to_replace
 
-    with _bad_input():
-        opened = read_run(run_dir)
-        check_inputs(opened.config)
-        chosen = _engine(opened.config, engine, workers, bind, keys, trust_cluster)
-    _execute(opened, chosen, until, force)
+    opened = read_run(run_dir)
+    check_inputs(opened.config)
+    chosen = choose(opened.config, until)
+    refuse_to_replace(opened, force or ())
+    _execute(opened, chosen, _engine(opened.config, engine, workers, bind, keys, trust_cluster), force)
+
+
+@app.command()
+def configs(
+    copy: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Copy them, and their experts, to be edited.")
+    ] = None,
+) -> None:
+    """List the configurations that come with oodil; each runs by its name."""
+    from oodil.pipeline.loading import SHIPPED, shipped_configs
+
+    if copy is not None:
+        if copy.exists():
+            raise ConfigError(f"{copy}: exists already; choose a new folder")
+        try:
+            shutil.copytree(SHIPPED, copy)
+        except OSError as error:
+            raise StorageError(f"{copy}: {error.strerror or error}") from error
+        print(f"{copy}: try `oodil run {copy}/quickstart.yaml`")
+        return
+    for name, path in shipped_configs().items():
+        first = path.read_text().splitlines()[0]
+        print(f"{name:<24} {first.removeprefix('# ') if first.startswith('# ') else ''}")
 
 
 @app.command()
@@ -109,8 +153,7 @@ def worker(
     from oodil.workers.keys import client_keys
     from oodil.workers.remote import WorkersError, serve
 
-    with _bad_input():
-        client_keys(keys)
+    client_keys(keys)
     with stop_flag(lambda: print("stopping")) as should_stop:
         try:
             serve(connect, keys, workers, logs, print, should_stop)
@@ -128,27 +171,25 @@ def new_keys(
     from oodil.workers.channels import new_key_pair
     from oodil.workers.keys import create_learner_keys, create_worker_keys
 
-    with _bad_input():
-        if worker is None:
-            create_learner_keys(folder, new_key_pair)
-            print(f"{folder}: the learner's keys; allow a machine with: oodil keys new {folder} --worker NAME")
-        else:
-            own = create_worker_keys(folder, worker, new_key_pair)
-            print(f"{own}: copy this folder to the machine, by a way that nobody else can read, and remove it here")
+    if worker is None:
+        create_learner_keys(folder, new_key_pair)
+        print(f"{folder}: the learner's keys; allow a machine with: oodil keys new {folder} --worker NAME")
+    else:
+        own = create_worker_keys(folder, worker, new_key_pair)
+        print(f"{own}: copy this folder to the machine, by a way that nobody else can read, and remove it here")
 
 
 @app.command()
 def status(run_dir: RunPath, as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False) -> None:
     """Say which stages are finished and what is known so far."""
-    from oodil.orchestrator import describe, read_run
+    from oodil.api import open_run
     from oodil.terminal import print_status
 
-    with _bad_input():
-        described = describe(read_run(run_dir))
+    results = open_run(run_dir)
     if as_json:
-        print(json.dumps(described, indent=2))
+        print(json.dumps(results.describe(), indent=2))
     else:
-        print_status(described)
+        print_status(results)
 
 
 @app.command()
@@ -157,45 +198,41 @@ def report(run_dir: RunPath) -> None:
     from oodil.orchestrator import read_run
     from oodil.pipeline.report import write_report
 
-    with _bad_input():
-        opened = read_run(run_dir)
-    print(write_report(opened))
+    print(write_report(read_run(run_dir)))
 
 
 @app.command()
 def evaluate(
     run_dir: RunPath,
     episodes: Annotated[int, typer.Option(min=1, help="Deterministic episodes.")] = 32,
-    stage: Annotated[str, typer.Option(help="Whose policy: imitation, naive_gail or oracle.")] = "imitation",
+    policy: Annotated[str | None, typer.Option(metavar="NAME", help="One policy; default: all that are done.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the episodes.")] = 0,
-    video: Annotated[bool, typer.Option("--video", help="Also film one episode.")] = False,
+    video: Annotated[bool, typer.Option("--video", help="Also film one episode of each.")] = False,
 ) -> None:
-    """Evaluate a trained policy on the true return of the imitator's environment."""
-    from oodil.orchestrator import read_run
-    from oodil.pipeline.evaluation import evaluate as evaluate_policy
+    """Evaluate trained policies on the true return of the imitator's environment."""
+    from oodil.api import evaluate as evaluate_policy
+    from oodil.api import open_run
     from oodil.pipeline.evaluation import film
-    from oodil.pipeline.policy import GaussianPolicy
-    from oodil.pipeline.seeding import derive_key
 
-    with _bad_input():
-        opened = read_run(run_dir)
-        policy = GaussianPolicy.from_arrays(opened.artifact(stage).arrays("policy.safetensors"))
-    environment = opened.config.environment
-    seen = evaluate_policy(policy, environment.id, environment.dynamics, episodes, derive_key(seed, "evaluate"))
-    print(
-        f"{stage}: return {seen.returns.mean():.1f} ± {seen.returns.std():.1f}, "
-        f"length {seen.lengths.mean():.0f}, {episodes} deterministic episodes, seed {seed}"
-    )
-    if video:
-        path = opened.directory.path / f"{stage}.mp4"
-        with _bad_input():
-            env_return = film(policy, environment.id, environment.dynamics, seed, path)
-        print(f"{path}: one episode, return {env_return:.1f}")
+    results = open_run(run_dir)
+    environment = results.config.environment
+    done = [each.name for each in results.policies if results.is_done(each.name)]
+    for name in [policy] if policy else done or [results.policies[0].name]:
+        trained = results.policy(name)
+        seen = evaluate_policy(trained, environment.id, environment.dynamics, episodes=episodes, seed=seed)
+        print(
+            f"{name}: return {seen.mean_return:.1f} ± {seen.std_return:.1f}, "
+            f"length {seen.mean_length:.0f}, {episodes} deterministic episodes, seed {seed}"
+        )
+        if video:
+            path = results.path / f"{name}.mp4"
+            env_return = film(trained, environment.id, environment.dynamics, seed, path)
+            print(f"{path}: one episode, return {env_return:.1f}")
 
 
 @app.command()
 def bench(
-    config_path: ConfigPath,
+    config_source: ConfigSource,
     overrides: Overrides = None,
     workers: Annotated[list[int] | None, typer.Option("--workers", "-w", min=0, help="Repeat for several.")] = None,
 ) -> None:
@@ -205,9 +242,8 @@ def bench(
     from oodil.pipeline.loading import load_config
     from oodil.terminal import print_bench
 
-    with _bad_input():
-        config = load_config(config_path, overrides)
-        check_inputs(config)
+    config = load_config(config_source, overrides)
+    check_inputs(config)
 
     def show(count: int, figures: dict[str, float]) -> None:
         print(f"{count} workers: {figures['steps_per_s']:,.0f} environment steps per second", file=sys.stderr)
@@ -218,44 +254,46 @@ def bench(
 @demos_app.command("inspect")
 def inspect_demos(path: Annotated[Path, typer.Argument(help="A file of demonstrations, or a run's folder.")]) -> None:
     """Show what a set of demonstrations contains."""
-    from oodil.orchestrator import read_run
+    from oodil.api import open_run
     from oodil.pipeline.datasets import read_demonstrations
     from oodil.terminal import print_demonstrations
 
-    with _bad_input():
-        file = path
-        if path.is_dir():
-            file = read_run(path).artifact("demonstrations").path / "demonstrations.safetensors"
-        demonstrations, environment = read_demonstrations(file)
-    print_demonstrations(file, demonstrations, environment)
+    if path.is_dir():
+        results = open_run(path)
+        print_demonstrations(path, results.demonstrations, results.config.environment.id)
+    else:
+        print_demonstrations(path, *read_demonstrations(path))
 
 
 @demos_app.command("collect")
 def collect_demos(
-    config_path: ConfigPath,
+    config_source: ConfigSource,
     overrides: Overrides = None,
     train: Annotated[bool, typer.Option("--train", help="First train the experts anew, and save them.")] = False,
     output: Annotated[Path, typer.Option(help="The file to write.")] = Path("demonstrations.safetensors"),
     workers: Workers = None,
 ) -> None:
     """Collect demonstrations from the experts of a configuration into one file; interrupted, it goes on."""
-    from oodil.orchestrator import check_inputs, open_run
+    from oodil.orchestrator import check_inputs, choose, open_run
+    from oodil.pipeline.artifacts import write_file
+    from oodil.pipeline.datasets import encode_demonstrations
     from oodil.pipeline.loading import load_config
-    from oodil.pipeline.stages import stages
+    from oodil.pipeline.stages.demonstrations import load_demonstrations
     from oodil.pipeline.stages.experts import ExpertsStage
 
-    with _bad_input():
-        config = load_config(config_path, overrides)
-        if not train:
-            check_inputs(config)
-        engine = _engine(config, "local", workers)
-        opened = open_run(output.with_name(f".{output.name}.run"), config)
+    config = load_config(config_source, overrides)
+    if not train:
+        check_inputs(config)
+    engine = _engine(config, "local", workers)
+    first = choose(config, until="demonstrations")
+    # What was collected for other settings is of no further use.
+    opened = open_run(output.with_name(f".{output.name}.run"), config, [stage.name for stage in first])
     if train:
         experts = ExpertsStage()
-        _walk(opened, [experts], engine, None)
+        _show_execution(opened, [experts], engine)
         print("\n".join(experts.export(opened)))
-    _walk(opened, stages(config)[:1], engine, None)
-    output.write_bytes(opened.artifact("demonstrations").read("demonstrations.safetensors"))
+    _show_execution(opened, first, engine)
+    write_file(output, encode_demonstrations(load_demonstrations(opened), config.environment.id))
     inspect_demos(output)
 
 
@@ -275,19 +313,19 @@ def convert_demos(
     ] = False,
 ) -> None:
     """Make one file of demonstrations from files in other formats; each becomes a source, named by its file."""
+    from oodil.pipeline.artifacts import write_file
     from oodil.pipeline.data import Demonstrations
     from oodil.pipeline.datasets import encode_demonstrations
     from oodil.pipeline.datasets.foreign import read_foreign
 
     parts = []
-    with _bad_input():
-        for source in sources:
-            label = source if source.startswith("minari:") else Path(source).stem
-            chosen = tuple(key for key in keys.split(",") if key)
-            part, recorded = read_foreign(source, label, chosen, ends_are_failures)
-            print(f"{source}: {len(part)} demonstrations" + (f" from {recorded}" if recorded else ""))
-            parts.append(part)
-        output.write_bytes(encode_demonstrations(Demonstrations.joined(parts), environment))
+    for source in sources:
+        label = source if source.startswith("minari:") else Path(source).stem
+        chosen = tuple(key for key in keys.split(",") if key)
+        part, recorded = read_foreign(source, label, chosen, ends_are_failures)
+        print(f"{source}: {len(part)} demonstrations" + (f" from {recorded}" if recorded else ""))
+        parts.append(part)
+    write_file(output, encode_demonstrations(Demonstrations.joined(parts), environment))
     inspect_demos(output)
 
 
@@ -297,16 +335,11 @@ def export_demos(
     target: Annotated[str, typer.Argument(help="FILE.csv, FILE.hdf5 (robomimic) or minari:DATASET_ID.")],
 ) -> None:
     """Write cluster, transferability and weight of every demonstration to a table, or to where they came from."""
-    from oodil.orchestrator import read_run
+    from oodil.api import open_run
     from oodil.pipeline.datasets.export import export
-    from oodil.pipeline.stages.demonstrations import load_demonstrations
 
-    with _bad_input():
-        opened = read_run(run_dir)
-        arrays = opened.artifact("transferability").arrays("transferability.safetensors")
-        columns = {"cluster": "clusters", "transferability": "scores", "weight": "weights"}
-        found = {name: arrays[held] for name, held in columns.items()}
-        print(export(load_demonstrations(opened), found, target))
+    results = open_run(run_dir)
+    print(export(results.demonstrations, results.transferability, target))
 
 
 def _engine(
@@ -338,59 +371,29 @@ def _engine(
     return RayEngine()
 
 
-def _execute(opened: "Run", engine: "Engine", until: str | None, force: str | None) -> None:
-    """Walk the stages, then write the report and print the summary."""
+def _execute(opened: "Run", chosen: "list[Stage]", engine: "Engine", force: list[str] | None) -> None:
+    """Execute the stages, then write the report and print the summary."""
     from oodil.pipeline.report import write_report
-    from oodil.pipeline.results import summary
-    from oodil.pipeline.stages import stages
+    from oodil.pipeline.runs import RunResults
     from oodil.terminal import print_summary
 
-    chosen = stages(opened.config)
-    names = [stage.name for stage in chosen]
-    with _bad_input():
-        for name in (until, force):
-            if name is not None and name not in names:
-                raise ConfigError(f"no stage {name!r}; this run has {', '.join(names)}")
     try:
-        _walk(opened, chosen[: names.index(until or names[-1]) + 1], engine, force)
+        _show_execution(opened, chosen, engine, force)
     finally:
         path = write_report(opened)
-    print_summary(summary(opened), path)
+    print_summary(RunResults(opened), path)
 
 
-def _walk(opened: "Run", chosen: list["Stage"], engine: "Engine", force: str | None) -> None:
-    from oodil.orchestrator import UnfinishedError, walk
-    from oodil.pipeline.loading import ConfigError
+def _show_execution(opened: "Run", chosen: "list[Stage]", engine: "Engine", force: list[str] | None = None) -> None:
+    from oodil.orchestrator import execute
+    from oodil.terminal import Display, stop_flag
 
     try:
-        walk(opened, chosen, engine, force)
-    except ConfigError as error:
-        print(f"oodil: {error}", file=sys.stderr)
-        raise typer.Exit(EXIT_BAD_INPUT) from None
-    except UnfinishedError as unfinished:
-        outcome = unfinished.outcome
-        for job, traceback in outcome.failed.items():
-            print(f"\n{unfinished.stage}/{job} failed:\n{traceback}", file=sys.stderr)
-        print(
-            f"\n{unfinished.stage}: {len(outcome.done)} jobs done, {len(outcome.failed)} failed, "
-            f"{len(outcome.not_run)} not finished. What is finished is kept; go on with: "
-            f"oodil resume {opened.directory.path}",
-            file=sys.stderr,
-        )
-        raise typer.Exit(EXIT_FAILED if outcome.failed else EXIT_STOPPED) from None
+        with Display() as display, stop_flag(display.stopping) as should_stop:
+            execute(opened, chosen, engine, display, should_stop, force or ())
     except KeyboardInterrupt:
         print(f"\nstopped at once; go on with: oodil resume {opened.directory.path}", file=sys.stderr)
         raise typer.Exit(EXIT_STOPPED) from None
-
-
-@contextmanager
-def _bad_input() -> Iterator[None]:
-    """Print what is wrong with the user's input in one message and exit with code 2."""
-    try:
-        yield
-    except OodilError as error:
-        print(f"oodil: {error}", file=sys.stderr)
-        raise typer.Exit(EXIT_BAD_INPUT) from None
 
 
 def main() -> None:

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from oodil.pipeline.runs import shown_return
+from oodil.orchestrator import Observer
+from oodil.pipeline.runs import RunResults, shown_return
 from oodil.workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, JobWarning, WorkerRestarted
 
 if TYPE_CHECKING:
@@ -45,8 +47,8 @@ def stop_flag(announce: Callable[[], None]) -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-class Display:
-    """What the orchestrator tells the user while it runs."""
+class Display(Observer):
+    """What a user sees of a run: live progress on a terminal, plain lines elsewhere."""
 
     def __init__(self) -> None:
         self._console = Console()
@@ -87,7 +89,7 @@ class Display:
         """Say that a stop was heard."""
         self.say("stopping after a checkpoint; press Ctrl-C again to stop at once")
 
-    def reused(self, stage: str) -> None:
+    def stage_reused(self, stage: str) -> None:
         """Say that a finished stage is taken as it is."""
         self.say(f"[green]✓[/] {stage}: reused")
 
@@ -144,49 +146,50 @@ def _duration(seconds: float) -> str:
     return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
 
 
-LABELS = {
-    "final_return": "final return, ours",
-    "naive_return": "final return, naive GAIL",
-    "oracle_return": "final return, oracle",
-    "purity": "cluster purity",
-    "auroc": "AUROC of the transferability",
-    "transferable_share": "transferable share of the sampling mass",
-    "env_steps": "environment steps",
-    "seconds": "time",
-}
-
-
-def print_summary(results: dict[str, float], report: Path) -> None:
+def print_summary(results: RunResults, report: Path) -> None:
     """Print the results known so far and where the report is."""
     console = Console()
     table = Table(show_header=False, box=None, padding=(0, 2))
-    for name, label in LABELS.items():
-        if name in results:
-            table.add_row(label, _figure(name, results[name]))
+    for label, figure in _summary_rows(results):
+        table.add_row(label, figure)
     console.print()
     console.print(table)
     console.print(f"\nreport: {report}", highlight=False, soft_wrap=True)
 
 
-def _figure(name: str, value: float) -> str:
-    if name == "seconds":
-        return _duration(value)
-    if name == "env_steps":
-        return f"{value:,.0f}"
-    return shown_return(value) if name.endswith("return") else f"{value:.3f}"
+def _summary_rows(results: RunResults) -> Iterator[tuple[str, str]]:
+    """Yield what is known of each policy, of each weighting, and of the whole run."""
+    found = results.summary()
+    for policy in results.policies:
+        value = found.get("policies", {}).get(policy.name, {}).get("mean_return")
+        if value is not None:
+            yield f"final return, {policy.title}", shown_return(value)
+    if "purity" in found:
+        yield "cluster purity", f"{found['purity']:.3f}"
+    for weighting in results.weightings:
+        figures = found.get("weightings", {}).get(weighting.name)
+        if figures:
+            yield f"AUROC, {weighting.title}", f"{figures['auroc']:.3f}"
+            shares = f"{figures['share_before']:.3f} -> {figures['share']:.3f}"
+            yield f"transferable share of the sampling mass, {weighting.title}", shares
+    if "env_steps" in found:
+        yield "environment steps", f"{found['env_steps']:,}"
+    if "seconds" in found:
+        yield "time", _duration(found["seconds"])
 
 
-def print_status(described: dict[str, Any]) -> None:
-    """Print the stages of a run and its results."""
+def print_status(results: RunResults) -> None:
+    """Print where the stages of a run stand, and its results."""
     console = Console()
-    table = Table("stage", "state", "seconds", "sha256", box=None, padding=(0, 2))
-    for name, entry in described["stages"].items():
-        seconds = f"{entry['seconds']:,.1f}" if "seconds" in entry else ""
-        table.add_row(name, entry["state"], seconds, (entry["sha256"] or entry.get("reason", ""))[:60])
-    console.print(f"{described['name']}, seed {described['seed']}  ({described['run']})", highlight=False)
+    table = Table("stage", "state", "seconds", "sha256 or reason", box=None, padding=(0, 2))
+    seconds = results.seconds()
+    for name, state in results.states.items():
+        took = f"{seconds[name]:,.1f}" if name in seconds else ""
+        table.add_row(name, state.state, took, escape(state.artifact.sha256[:12] if state.artifact else state.reason))
+    console.print(f"{results.config.name}, seed {results.config.seed}  ({results.path})", highlight=False)
     console.print(table)
-    for name, value in described["results"].items():
-        console.print(f"  {LABELS.get(name, name)}: {_figure(name, value)}", highlight=False)
+    for label, figure in _summary_rows(results):
+        console.print(f"  {label}: {figure}", highlight=False)
 
 
 def print_demonstrations(path: Path, demonstrations: "Demonstrations", environment: str) -> None:

@@ -22,8 +22,8 @@ pytestmark = pytest.mark.timeout(300)
 
 DATA_SET = "mine/hopper-v0"
 SMALL = """clustering.num_clusters=2 clustering.joint_iterations=15 transferability.gail.total_steps=8000
-transferability.gail.num_groups=2 transferability.num_scores=4 imitation.gail.total_steps=8000
-imitation.gail.num_evaluations=1 imitation.final_episodes=2"""
+transferability.gail.num_groups=2 evaluation.num_scores=4 imitation.gail.total_steps=8000
+evaluation.num_points=1 evaluation.final_episodes=2"""
 
 
 def make_data_set() -> None:

@@ -1,0 +1,98 @@
+"""The functions behind ``import oodil``; each is what a command of the command line does."""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from oodil.orchestrator import Observer, check_inputs, choose, execute, read_run
+from oodil.orchestrator import open_run as open_folder
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.evaluation import evaluate as evaluate_policy
+from oodil.pipeline.loading import load_config
+from oodil.pipeline.results import Evaluation, Policy
+from oodil.pipeline.runs import RunResults
+from oodil.pipeline.seeding import derive_key
+from oodil.workers.engine import Engine, LocalEngine
+
+__all__ = ["evaluate", "open_run", "run"]
+
+
+def run(
+    config: str | Path | Mapping[str, Any] | RunConfig,
+    overrides: Sequence[str] = (),
+    *,
+    workers: int | None = None,
+    run_dir: str | Path | None = None,
+    until: str | None = None,
+    force: Collection[str] = (),
+    observer: Observer | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    engine: Engine | None = None,
+) -> RunResults:
+    """Run the pipeline; what is finished is reused, what was interrupted goes on.
+
+    It works in a notebook, in a thread and in a script without a ``__main__`` guard; it prints nothing, and handles no
+    signal. The report is not written; see `oodil.pipeline.report.write_report`.
+
+    Args:
+        config: a YAML file, the name of a configuration that comes with oodil, plain values or a `RunConfig`.
+        overrides: ``key.sub=value`` each, as on the command line.
+        workers: parallel processes; 0 computes everything in this one. Default: ``runtime.workers`` of the
+            configuration. It changes no bit of the result.
+        run_dir: the run's folder; default: ``runs/NAME-seedSEED``.
+        until: stop after this stage.
+        force: stages to compute again although they are finished.
+        observer: is told what happens, in this thread.
+        should_stop: once it returns true, running jobs write a checkpoint and stop.
+        engine: where jobs run, instead of ``workers`` processes of this machine.
+
+    Raises OodilError for what the caller can mend, `UnfinishedError` when a job failed or a stop was asked for.
+
+    Example:
+        >>> results = oodil.run("quickstart", overrides=["seed=3"], workers=2)  # doctest: +SKIP
+        >>> results.summary()["policies"]["imitation"]["mean_return"]  # doctest: +SKIP
+    """
+    loaded = load_config(config, overrides)
+    check_inputs(loaded)
+    chosen = choose(loaded, until)
+    where = engine or LocalEngine(loaded.runtime.workers if workers is None else workers)
+    opened = open_folder(default_folder(loaded) if run_dir is None else Path(run_dir), loaded, force)
+    execute(opened, chosen, where, observer, should_stop, force)
+    return RunResults(opened)
+
+
+def open_run(path: str | Path) -> RunResults:
+    """Return what a run's folder holds, whether or not the run is finished.
+
+    Raises ConfigError if it is not a run.
+
+    Example:
+        >>> results = oodil.open_run("runs/quickstart-seed0")  # doctest: +SKIP
+        >>> results.transferability.table()[0]  # doctest: +SKIP
+        {'demonstration': 0, 'cluster': 2, 'transferability': 0.41, 'weight': 0.049}
+    """
+    return RunResults(read_run(Path(path)))
+
+
+def evaluate(
+    policy: Policy,
+    environment: str,
+    dynamics: Mapping[str, float] | None = None,
+    *,
+    episodes: int = 32,
+    seed: int = 0,
+) -> Evaluation:
+    """Return true returns and lengths of fresh episodes with the policy's mean actions.
+
+    Raises UnusableEnvironmentError for an environment that cannot be made.
+
+    Example:
+        >>> policy = oodil.open_run("runs/quickstart-seed0").policy()  # doctest: +SKIP
+        >>> oodil.evaluate(policy, "oodil/Hopper-v0", {"gravity": 12.0}).mean_return  # doctest: +SKIP
+    """
+    return evaluate_policy(policy.gaussian, environment, dynamics or {}, episodes, derive_key(seed, "evaluate"))
+
+
+def default_folder(config: RunConfig) -> Path:
+    """Return where a run lies unless its caller says otherwise."""
+    return Path("runs") / f"{config.name}-seed{config.seed}"
