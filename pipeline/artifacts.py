@@ -178,9 +178,12 @@ def read_artifact(path: Path) -> Artifact | None:
 
 
 def remove_artifact(path: Path) -> None:
-    """Delete an artifact; its manifest goes first, so that half a deletion is no artifact."""
-    (path / MANIFEST).unlink(missing_ok=True)
-    _remove(path)
+    """Delete an artifact; its manifest goes first, so that half a deletion is no artifact. Raises StorageError."""
+    try:
+        (path / MANIFEST).unlink(missing_ok=True)
+        _remove(path)
+    except OSError as error:
+        raise StorageError(f"{path}: {error.strerror or error}") from error
 
 
 def _remove(path: Path) -> None:

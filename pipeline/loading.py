@@ -44,7 +44,8 @@ def load_config(
     Args:
         source: a YAML file, the name of a shipped configuration, plain values or a configuration. Paths in a file are
             relative to it, those in plain values to the working directory.
-        overrides: ``key.sub=value``, the value in YAML; a number reaches into a list: ``demonstrations.sources.2.count=5``.
+        overrides: ``key.sub=value``, the value in YAML; a number reaches into a list, as in
+            ``demonstrations.sources.2.count=500``.
 
     Raises ConfigError with one line per problem.
     """

@@ -142,6 +142,11 @@ def stage_named(name: str, module: str = _OURS) -> Stage:
     return _REGISTRY[name]
 
 
+def registered() -> list[Stage]:
+    """Return every stage that is known by now."""
+    return list(_REGISTRY.values())
+
+
 @dataclass(frozen=True)
 class StageState:
     """Where a stage of a run stands."""

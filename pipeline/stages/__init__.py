@@ -6,7 +6,7 @@ starting one, does not wait for torch.
 
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.errors import ConfigError
-from oodil.pipeline.stage import Stage, stage_named
+from oodil.pipeline.stage import Stage, registered, stage_named
 from oodil.pipeline.stages import clustering, demonstrations, experts, imitators, marks, policies, transferability
 from oodil.pipeline.stages.policies import PolicyStage
 from oodil.pipeline.stages.weighting import Weighting
@@ -37,12 +37,10 @@ def stages(config: RunConfig) -> list[Stage]:
             add(needed)
         found.setdefault(name, stage)
 
+    known = [stage.name for stage in registered() if isinstance(stage, PolicyStage)]
     for name in ("imitation", *config.baselines):
-        try:
-            if not isinstance(stage_named(name), PolicyStage):
-                raise ConfigError(f"{name!r} is not a policy")
-        except ConfigError as error:
-            raise ConfigError(f"baselines: {error}") from None
+        if name not in known:
+            raise ConfigError(f"baselines: no policy {name!r}; there are {', '.join(known)}")
         add(name)
     return list(found.values())
 

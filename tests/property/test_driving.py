@@ -11,8 +11,8 @@ from oodil.pipeline.environments import make_batch
 from oodil.pipeline.environments.driving import GOAL, DrivingBatch, DrivingEnv, layout, touches
 from oodil.pipeline.errors import OodilError
 from oodil.pipeline.evaluation import run_episodes
-from oodil.pipeline.experts import hand_written
 from oodil.pipeline.seeding import numpy_rng
+from oodil.pipeline.stages.demonstrations import hand_written
 
 ID = "oodil/Driving-v0"
 SHARES = st.floats(0.05, 0.45)

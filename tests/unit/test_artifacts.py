@@ -21,7 +21,7 @@ from oodil.pipeline.artifacts import (
     remove_artifact,
     write_artifact,
 )
-from oodil.pipeline.errors import DamagedArtifactError
+from oodil.pipeline.errors import DamagedArtifactError, StorageError
 
 OLD = {"a.json": b"old a", "b.bin": b"old b"}
 NEW = {"a.json": b"new a", "c.bin": b"new c"}
@@ -136,7 +136,7 @@ def test_a_full_disk_leaves_the_old_artifact(path, monkeypatch):
     for failing in range(num_calls):
         with monkeypatch.context() as patch:
             full_disk_at(patch, "fsync", failing)
-            with pytest.raises(OSError, match="No space left"):
+            with pytest.raises(StorageError, match="No space left"):
                 write_artifact(path, {}, NEW)
         assert contents(path) == (NEW if failing == num_calls - 1 else OLD)
     write_artifact(path, {}, OLD)
@@ -148,7 +148,7 @@ def test_a_failing_rename_leaves_the_old_artifact(path, monkeypatch, failing):
     write_artifact(path, {}, OLD)
     with monkeypatch.context() as patch:
         full_disk_at(patch, "rename", failing)
-        with pytest.raises(OSError, match="No space left"):
+        with pytest.raises(StorageError, match="No space left"):
             write_artifact(path, {}, NEW)
     assert contents(path) == OLD
 
@@ -189,7 +189,7 @@ def test_removal_takes_the_manifest_first(path, monkeypatch):
     write_artifact(path, {}, OLD)
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "rmtree", lambda *_: (_ for _ in ()).throw(OSError("stopped half-way")))
-        with pytest.raises(OSError, match="half-way"):
+        with pytest.raises(StorageError, match="half-way"):
             remove_artifact(path)
     assert read_artifact(path) is None
     remove_artifact(path)
@@ -293,7 +293,7 @@ class TestCheckpoints:
         self.save(checkpoints, 1, 2)
         with monkeypatch.context() as patch:
             full_disk_at(patch, "fsync", 0)
-            with pytest.raises(OSError, match="No space left"):
+            with pytest.raises(StorageError, match="No space left"):
                 self.save(checkpoints, 3)
         assert self.loaded(checkpoints) == (2, [])
 

@@ -21,6 +21,7 @@ from oodil.pipeline.artifacts import RunDirectory, write_artifact
 from oodil.pipeline.config import ClusteringConfig, RunConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.errors import DataError
+from oodil.pipeline.results import ClusterDiagnostics
 from oodil.pipeline.stage import JobStoppedError, Run
 from oodil.pipeline.stages import clustering as stage_module
 from oodil.pipeline.stages.clustering import ClusteringStage, contingency, diagnostics, purity
@@ -98,8 +99,8 @@ def test_three_dynamics_are_told_apart_with_five_clusters():
     labelling = clustering.model().label(demonstrations, draws=5, root_seed=0)
 
     report = diagnostics(labelling, demonstrations, 5)
-    assert report["purity"] == 1.0
-    assert report["label_stability"] > 0.7  # a mode may be split in two, and then a draw falls on either side
+    assert report.purity == 1.0
+    assert report.label_stability > 0.7  # a mode may be split in two, and then a draw falls on either side
     np.testing.assert_allclose(np.linalg.norm(labelling.features, axis=1), 1, rtol=1e-5)
     # The frozen model finds the same dynamics in demonstrations that it has never seen.
     new = three_dynamics((10, 10, 10), seed=1)
@@ -118,8 +119,8 @@ def test_a_model_without_training_data_for_a_center_leaves_that_cluster_empty():
         model.encoder, far, torch.ones(2), model.sampling, model.state_mean, model.state_scale
     ).label(demonstrations, draws=2, root_seed=0)
     report = diagnostics(labelling, demonstrations, 2)
-    assert report["cluster_sizes"] == [9, 0]
-    assert (report["non_empty_clusters"], report["silhouette"], report["calinski_harabasz"]) == (1, None, None)
+    assert report.cluster_sizes == (9, 0)
+    assert (report.non_empty_clusters, report.silhouette, report.calinski_harabasz) == (1, None, None)
 
 
 def test_diagnostics_by_hand():
@@ -127,12 +128,12 @@ def test_diagnostics_by_hand():
     features = np.array([[1, 0], [1, 0.1], [0, 1], [0.1, 1], [0, 1], [0.9, 0]], np.float32)
     labels = np.array([0, 0, 3, 3, 3, 0], np.int32)
     report = diagnostics(Labelling(labels, features, stability=0.75), demonstrations, num_clusters=4)
-    assert report["contingency"] == {"slow": [2, 0, 0, 0], "middle": [0, 0, 0, 3], "fast": [1, 0, 0, 0]}
-    assert report["purity"] == pytest.approx(5 / 6)
-    assert report["cluster_sizes"] == [3, 0, 0, 3]
-    assert (report["num_clusters"], report["non_empty_clusters"], report["label_stability"]) == (4, 2, 0.75)
-    assert report["silhouette"] == pytest.approx(silhouette_score(features, labels, metric="cosine"))
-    assert report["calinski_harabasz"] == pytest.approx(calinski_harabasz_score(features, labels))
+    assert report.contingency == ((2, 0, 0, 0), (0, 0, 0, 3), (1, 0, 0, 0))
+    assert report.purity == pytest.approx(5 / 6)
+    assert report.cluster_sizes == (3, 0, 0, 3)
+    assert (report.num_clusters, report.non_empty_clusters, report.label_stability) == (4, 2, 0.75)
+    assert report.silhouette == pytest.approx(silhouette_score(features, labels, metric="cosine"))
+    assert report.calinski_harabasz == pytest.approx(calinski_harabasz_score(features, labels))
     assert purity(np.array([[2, 0], [2, 0]])) == 0.5
 
 
@@ -272,10 +273,10 @@ def test_the_files_of_the_stage(make_run):
     model = ClusterModel.from_arrays(artifact.arrays("encoder.safetensors"))
     demonstrations = stage_module.load_demonstrations(run)
     np.testing.assert_array_equal(model.label(demonstrations, 5, root_seed=0).labels, assignment["labels"])
-    report = artifact.json("diagnostics.json")
-    assert sum(report["cluster_sizes"]) == 20
-    assert report["shortened_subtrajectories"] == 0
-    assert set(report["contingency"]) == {"slow", "middle", "fast"}
+    report = ClusterDiagnostics.load(artifact)
+    assert sum(report.cluster_sizes) == 20
+    assert report.shortened_subtrajectories == 0
+    assert len(report.contingency) == 3
 
 
 def test_another_seed_gives_another_encoder(make_run):
@@ -289,9 +290,9 @@ def test_one_cluster_takes_everything_without_training(make_run):
     artifact = write_artifact(run.directory.stage("clustering"), {}, STAGE.run_job(run, "clustering", context))
     assert context.reports == []
     assert not artifact.arrays("assignment.safetensors")["labels"].any()
-    report = artifact.json("diagnostics.json")
-    assert report["cluster_sizes"] == [20] and report["silhouette"] is None
-    assert report["purity"] == pytest.approx(8 / 20)
+    report = ClusterDiagnostics.load(artifact)
+    assert report.cluster_sizes == (20,) and report.silhouette is None
+    assert report.purity == pytest.approx(8 / 20)
 
 
 def leaning(counts: tuple[int, int, int], seed: int = 0) -> Demonstrations:

@@ -78,6 +78,8 @@ def test_overrides_reach_every_depth_and_are_typed(write):
         "clustering.num_clusters=1",
         "runtime.workers=0",
         "environment.dynamics.gravity=9.8",
+        "demonstrations.sources.0.count=500",
+        "demonstrations.sources.0.dynamics.gravity=2.0",
         "name=a-b",
     ]
     config = load_config(write(values()), overrides)
@@ -87,6 +89,21 @@ def test_overrides_reach_every_depth_and_are_typed(write):
     assert config.transferability.gail.policy_optimizer == TrpoConfig(max_kl=0.02)
     assert (config.clustering.num_clusters, config.runtime.workers, config.name) == (1, 0, "a-b")
     assert config.environment.dynamics == {"gravity": 9.8}
+    assert config.demonstrations.sources[0].count == 500
+    assert config.demonstrations.sources[0].dynamics == {"gravity": 2.0}
+
+
+def test_a_shipped_configuration_is_found_by_its_name_and_plain_values_are_one_too(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert load_config("hopper") == load_config(ROOT / "configs" / "hopper.yaml") == load_config("hopper.yaml")
+    assert load_config("quick/driving", ["seed=2"]).seed == 2
+    with pytest.raises(ConfigError, match=r"hoper: no such file, and no configuration .*did you mean 'hopper'\?"):
+        load_config("hoper")
+    given = values()
+    config = load_config(given, ["seed=3"])
+    assert config.seed == 3 and given == values(), "the caller's values are left alone"
+    assert config.demonstrations.sources[0].expert == tmp_path / "experts" / "heavy"
+    assert load_config(config, ["seed=4"]) == config.model_copy(update={"seed": 4})
 
 
 def test_an_override_wins_over_the_file_and_the_last_one_wins(write):
@@ -99,7 +116,8 @@ def test_an_override_wins_over_the_file_and_the_last_one_wins(write):
         ("seed", "'seed' is not of the form key=value"),
         ("=3", "'=3' is not of the form key=value"),
         ("seed.deeper=3", "seed is not a section"),
-        ("demonstrations.sources.count=3", "sources is not a section"),
+        ("demonstrations.sources.count=3", "count is not an entry of the list, which has 0 to 0"),
+        ("demonstrations.sources.1.count=3", "1 is not an entry of the list, which has 0 to 0"),
         ("seed=[1", r"'seed=\[1': the value is not valid YAML"),
         ("sed=3", "unknown key 'sed'; did you mean 'seed'"),
         ("runtime.wokers=3", "unknown key 'runtime.wokers'; did you mean 'workers'"),
@@ -144,6 +162,7 @@ def test_bad_overrides_are_refused(write, override, message):
         ),
         ({"environment": {"dynamics": {"gravity": "low"}}}, "environment.dynamics.gravity: .*number.*got 'low'"),
         ({"environment": {"dynamics": {"gravity": float("inf")}}}, "environment.dynamics.gravity: .*finite.*got inf"),
+        ({"clustering": {"preset": ["paper"]}}, r"clustering: preset is \['paper'\]; there are paper, official"),
         ({"clustering": {"preset": "offical"}}, "clustering: preset is 'offical'; there are paper, official"),
         ({"clustering": {"update_order": "both"}}, "clustering.update_order: .*step_first.*got 'both'"),
         ({"clustering": []}, "clustering: "),
@@ -151,7 +170,7 @@ def test_bad_overrides_are_refused(write, override, message):
         ({"demonstrations": {"file": "a", "sources": [SOURCE]}}, "demonstrations: give either file or sources"),
         ({"demonstrations": {"sources": [SOURCE, SOURCE]}}, "two sources have the same label"),
         ({"baselines": ["oracle"]}, "the oracle needs sources that are marked transferable"),
-        ({"baselines": ["bc"]}, "baselines.0: .*naive_gail.*got 'bc'"),
+        ({"baselines": ["bc"]}, "config: baselines: no policy 'bc'; there are imitation, naive_gail, oracle"),
         ({"runtime": {"workers": -1}}, "runtime.workers: .*greater than or equal to 0, got -1"),
     ],
 )
@@ -183,7 +202,7 @@ def test_files_that_are_no_configuration_are_named(write, content, message):
 
 
 def test_binary_and_missing_files_are_named(tmp_path):
-    with pytest.raises(ConfigError, match=r"gone\.yaml: No such file"):
+    with pytest.raises(ConfigError, match=r"gone\.yaml: no such file"):
         load_config(tmp_path / "gone.yaml")
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(ConfigError, match=r"binary\.yaml: not valid YAML"):

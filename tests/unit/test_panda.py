@@ -13,8 +13,8 @@ from oodil.pipeline.environments import make_batch
 from oodil.pipeline.environments.panda import ALL_JOINTS, Arm, judge, start_angles
 from oodil.pipeline.errors import OodilError
 from oodil.pipeline.evaluation import run_episodes
-from oodil.pipeline.experts import hand_written
 from oodil.pipeline.seeding import numpy_rng
+from oodil.pipeline.stages.demonstrations import hand_written
 
 ID, SLOW_ID = "oodil/Panda-v0", "oodil/Panda20Hz-v0"
 ARMS = {"whole": (), "1": (1,), "3": (3,), "4": (4,), "6": (6,), "1, 3": (1, 3), "1, 3, 4": (1, 3, 4)}
