@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from oodil.cli import app
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.datasets import encode_demonstrations
+from oodil.pipeline.loading import load_config
 from tests.runs import MICRO, ROOT
 
 HOPPER = "oodil/Hopper-v0"
@@ -72,8 +73,29 @@ def test_configuration(tmp_path: Path, override: str, message: str) -> None:
     assert not (tmp_path / "run").exists()
 
 
+def test_shipped_configurations_are_listed_and_copied(tmp_path: Path) -> None:
+    listed = CliRunner().invoke(app, ["configs"]).output
+    assert all(name in listed for name in ("quickstart", "hopper", "quick/driving"))
+    copied = CliRunner().invoke(app, ["configs", "--copy", str(tmp_path / "mine")])
+    assert copied.exit_code == 0, copied.output
+    assert load_config(tmp_path / "mine" / "smoke.yaml") != load_config("smoke"), "experts are those of the copy"
+    assert "exists already" in refused("configs", "--copy", str(tmp_path / "mine"))
+    assert "did you mean 'hopper'?" in refused("run", "hoper", "--run-dir", str(tmp_path / "run"))
+
+
+def test_a_defect_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only what the user can mend becomes a message; a missing key in our own code does not."""
+
+    def broken(*_: object) -> None:
+        raise KeyError("weights")
+
+    monkeypatch.setattr("oodil.orchestrator.check_inputs", broken)
+    result = CliRunner().invoke(app, ["run", str(MICRO)])
+    assert isinstance(result.exception, KeyError) and result.exit_code == 1
+
+
 def test_configuration_file_that_is_missing_or_no_mapping(tmp_path: Path) -> None:
-    assert "nowhere.yaml: No such file" in refused("run", str(tmp_path / "nowhere.yaml"))
+    assert "nowhere.yaml: no such file" in refused("run", str(tmp_path / "nowhere.yaml"))
     (tmp_path / "list.yaml").write_text("- 1\n")
     assert "expected a mapping" in refused("run", str(tmp_path / "list.yaml"))
 
