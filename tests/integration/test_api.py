@@ -134,7 +134,15 @@ def test_stable_baselines3_evaluates_it(results: oodil.RunResults) -> None:
     assert np.isfinite(std) and abs(mean - ours.mean_return) < 4 * ours.std_return + 50
 
 
-def test_gymnasium_knows_our_environments_without_an_import_of_ours() -> None:
-    probe = "import gymnasium; print(gymnasium.make('oodil/Hopper-v0', gravity=12.0).unwrapped.model.opt.gravity[2])"
+@pytest.mark.parametrize(
+    "program",
+    [
+        "import gymnasium; env = gymnasium.make('oodil:oodil/Hopper-v0', gravity=12.0)",
+        "import gymnasium, oodil; env = gymnasium.make('oodil/Hopper-v0', gravity=12.0)",
+        "import oodil; oodil.evaluate; import gymnasium; env = gymnasium.make('oodil/Hopper-v0', gravity=12.0)",
+    ],
+)
+def test_gymnasium_knows_our_environments(program: str) -> None:
+    probe = f"{program}; print(env.unwrapped.model.opt.gravity[2])"
     shown = subprocess.run([sys.executable, "-c", probe], check=True, capture_output=True, text=True)
-    assert shown.stdout.strip() == "-12.0" and "Warn" not in shown.stderr
+    assert shown.stdout.strip() == "-12.0" and "WARN" not in shown.stderr
