@@ -29,8 +29,8 @@ from oodil.workers.messages import (
     decode,
     encode,
 )
-from oodil.workers.supervisor import Died, Restarts, Started, Supervisor
-from oodil.workers.supervisor import Event as ChildEvent
+from oodil.workers.reports import Event, Failed, Started
+from oodil.workers.supervisor import Supervisor
 from oodil.workers.zmq_rollouts import ZmqRollouts
 from tests.fakes import chain, hopper_units, wait_until
 
@@ -297,14 +297,15 @@ def test_a_worker_process_that_dies_or_hangs_is_replaced_and_changes_nothing(
     tmp_path: Path, endpoint: str, is_killed: bool, assert_same_bits: SameBits
 ) -> None:
     units = hopper_units(0)
+    arguments = {"endpoint": endpoint, "run_id": RUN}
     silent: list[str] = []
-    events: list[ChildEvent] = []
+    events: list[Event] = []
     rollouts = ZmqRollouts(endpoint, RUN, "learner.1", unit_timeout_s=5.0, report_silent=silent.append)
     results: list[UnitResult] = []
     gathering = threading.Thread(target=lambda: results.extend(rollouts.gather()), daemon=True)
     with Supervisor(tmp_path, "test") as supervisor:
         try:
-            supervisor.start("worker", rollout_worker.main, {"endpoint": endpoint, "run_id": RUN}, Restarts(20, 0.0))
+            supervisor.start("worker", rollout_worker.main, arguments)
             supervisor.poll(0.0)
             wait_until(lambda: bool(rollouts._dispatcher._workers))
             (process,) = multiprocessing.active_children()
@@ -320,15 +321,19 @@ def test_a_worker_process_that_dies_or_hangs_is_replaced_and_changes_nothing(
             def is_gathered() -> bool:
                 while silent:
                     supervisor.kill(silent.pop())
-                events.extend(supervisor.poll(0.05))
+                for event in supervisor.poll(0.05):
+                    events.append(event)
+                    if isinstance(event.report, Failed):
+                        supervisor.start("worker", rollout_worker.main, arguments)
                 return not gathering.is_alive()
 
             wait_until(is_gathered, 60.0)
         finally:
             rollouts.close()
     assert_same_bits(results, inline(units))
-    assert [type(event) for event in events[:2]] == [Died, Started]
-    assert isinstance(events[0], Died) and events[0].reason.startswith("killed by SIGKILL")
+    failed, again = events[0].report, events[1].report
+    assert isinstance(failed, Failed) and failed.reason.startswith("killed by SIGKILL")
+    assert again == Started(2)
 
 
 def test_a_worker_with_other_libraries_is_refused_with_the_reason(endpoint: str, source: ZmqRollouts) -> None:

@@ -18,7 +18,7 @@ from oodil.pipeline.loading import parse_config
 from oodil.pipeline.seeding import numpy_rng
 from oodil.pipeline.stage import Run
 from oodil.pipeline.stages.transferability import TransferabilityStage
-from oodil.workers.engine import LocalEngine
+from oodil.workers.local_engine import LocalEngine
 from tests.runs import ROOT
 
 pytestmark = pytest.mark.timeout(1200)

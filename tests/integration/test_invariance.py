@@ -66,7 +66,7 @@ def test_a_reward_of_nan_trains_to_the_same_bits(inline: Path, tmp_path: Path, m
     from oodil.pipeline.artifacts import RunDirectory
     from oodil.pipeline.stage import Run
     from oodil.pipeline.stages import stages
-    from oodil.workers.engine import LocalEngine
+    from oodil.workers.local_engine import LocalEngine
 
     config = load_config(MICRO, [NAIVE, "environment.id=oodil/NanHopper-v0"])
     poisoned = Run(config, RunDirectory(tmp_path / "run"))
