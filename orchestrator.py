@@ -21,7 +21,8 @@ from oodil.pipeline.stage import Run, Stage, state_of
 from oodil.pipeline.stages import stages
 from oodil.pipeline.stages.demonstrations import check_demonstrations
 from oodil.pipeline.versions import library_versions
-from oodil.workers.engine import Engine, Event, Outcome
+from oodil.workers.engine import Engine, Outcome
+from oodil.workers.reports import Event
 
 
 class Observer:

@@ -21,7 +21,7 @@ from oodil.pipeline.stage import Run
 from oodil.pipeline.stages.experts import load_expert
 from oodil.pipeline.stages.imitators import ImitatorsStage
 from oodil.pipeline.stages.transferability import TransferabilityStage
-from oodil.workers.engine import LocalEngine
+from oodil.workers.local_engine import LocalEngine
 from tests.runs import ROOT
 
 pytestmark = pytest.mark.timeout(1200)
