@@ -169,3 +169,27 @@ def test_a_run_directory_of_another_run(tmp_path: Path) -> None:
 def test_what_is_no_run(tmp_path: Path) -> None:
     for command in ("status", "resume", "report", "evaluate"):
         assert "is not a run" in refused(command, str(tmp_path))
+
+
+def test_a_folder_that_cannot_be_made_and_a_file_that_cannot_be_written(config_for, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    inside = str(tmp_path / "file" / "run")
+    assert f"{inside}: Not a directory" in refused("run", str(MICRO), "--run-dir", inside)
+    _, file = config_for(safetensors.numpy.save(arrays()))
+    (tmp_path / "states.npz").write_bytes(b"")
+    np.savez(tmp_path / "states.npz", *np.zeros((2, 5, 12), np.float32))
+    target = tmp_path / "file" / "out.safetensors"
+    convert = ("demos", "convert", str(tmp_path / "states.npz"), "--environment", HOPPER, "--output", str(target))
+    assert f"{target}: Not a directory" in refused(*convert)
+
+
+def test_a_damaged_artifact_is_one_message(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    until = ("--run-dir", str(run_dir), "--workers", "0", "--until", "demonstrations")
+    result = CliRunner().invoke(app, ["run", str(MICRO), *until])
+    assert result.exit_code == 0, result.output
+    (file,) = (run_dir / "stages" / "demonstrations").glob("*.safetensors")
+    file.write_bytes(file.read_bytes()[:-1])
+    assert "demonstrations is damaged" in refused("demos", "inspect", str(run_dir))
+    (run_dir / "config.json").write_text("{")
+    assert "config.json: cannot be read" in refused("status", str(run_dir))
