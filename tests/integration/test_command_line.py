@@ -171,12 +171,10 @@ def test_what_is_no_run(tmp_path: Path) -> None:
         assert "is not a run" in refused(command, str(tmp_path))
 
 
-def test_a_folder_that_cannot_be_made_and_a_file_that_cannot_be_written(config_for, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_and_a_file_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     inside = str(tmp_path / "file" / "run")
     assert f"{inside}: Not a directory" in refused("run", str(MICRO), "--run-dir", inside)
-    _, file = config_for(safetensors.numpy.save(arrays()))
-    (tmp_path / "states.npz").write_bytes(b"")
     np.savez(tmp_path / "states.npz", *np.zeros((2, 5, 12), np.float32))
     target = tmp_path / "file" / "out.safetensors"
     convert = ("demos", "convert", str(tmp_path / "states.npz"), "--environment", HOPPER, "--output", str(target))

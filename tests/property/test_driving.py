@@ -24,6 +24,7 @@ SOURCES = {
 }
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(SHARES, SHARES, st.floats(0.5, 8.0), st.integers(0, 2**31 - 1))
 def test_the_batch_drives_as_highway_env_does(first: float, second: float, speed: float, seed: int) -> None:

@@ -132,17 +132,20 @@ def test_the_servo_turns_a_joint_by_its_distance_to_the_wanted_angle() -> None:
     np.testing.assert_allclose(done, 1 - np.exp(-1), rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", [ID, SLOW_ID])
 @pytest.mark.parametrize("locked", ARMS.values(), ids=ARMS)
 def test_the_demonstrator_pushes_the_box_to_the_goal(locked: tuple[int, ...], env_id: str) -> None:
     assert sum(episode.env_return > 900 for episode in demonstrated(locked, env_id)) >= 5
 
 
+@pytest.mark.slow
 def test_two_joints_are_not_enough() -> None:
     """With joints 2 and 5 alone, an arm pushes the box a few centimetres and then lifts its hand over it."""
     assert max(episode.states[:, 3].max() for episode in demonstrated((1, 3, 4, 6))) < 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("locked", "is_low"), [((1, 3), True), ((1, 3, 4), False)])
 def test_a_locked_elbow_keeps_the_hand_above_the_middle_of_the_box(locked: tuple[int, ...], is_low: bool) -> None:
     """So it cannot follow those that push there."""
