@@ -30,7 +30,7 @@ check: install
 	$(BIN)/mypy
 
 unit: install
-	$(BIN)/python -m pytest -n 2 -m "not slow and not ray" tests/unit tests/property
+	$(BIN)/python -m pytest -n 2 -m "not slow" tests/unit tests/property
 
 test: check
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder

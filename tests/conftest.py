@@ -26,6 +26,13 @@ hypothesis.settings.load_profile("oodil")
 Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of whole runs and real processes are slow; among the others, the slow ones say so themselves."""
+    for item in items:
+        if {"integration", "fault"} & set(item.path.parts):
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture
 def network() -> Callable[..., PolicyNetwork]:
     """Return a function that builds a policy network whose head is not small, so that actions depend on states."""

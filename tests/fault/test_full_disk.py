@@ -8,7 +8,7 @@ import pytest
 
 from tests.runs import MICRO, LiveRun, artifacts, run
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.root, pytest.mark.timeout(300)]
 SETTINGS = ("baselines=[]", "runtime.max_attempts=1")
 
 

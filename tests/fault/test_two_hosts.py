@@ -15,7 +15,7 @@ from oodil.workers.channels import new_key_pair
 from oodil.workers.keys import create_learner_keys, create_worker_keys
 from tests.runs import MICRO, ROOT, LiveRun, artifacts, has_checkpoint, nothing_left, run, wait_for
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.root, pytest.mark.timeout(300)]
 
 LAB, ELSEWHERE = "10.213.77.1", "10.213.77.2"
 CUT_S = 3.0

@@ -24,7 +24,7 @@ from tests.fakes import FakeStage, chain, failures, fake_run, hopper_units, line
 from tests.flaky import FOLDER_VARIABLE
 from tests.runs import MICRO
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.ray, pytest.mark.timeout(300)]
 
 STALLING = "tests.flaky:StallingPendulum-v0"
 PENDULUM_POLICY = GaussianPolicy(

@@ -14,7 +14,7 @@ import oodil
 from tests import pinned
 from tests.runs import ROOT
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.timeout(900)
 DECOYS = ("pipeline", "workers", "walk", "bench", "terminal", "orchestrator", "cli", "configs")
 """Modules that a user may well have, and that oodil must never take for its own."""
 
