@@ -48,6 +48,8 @@ CLUSTERS = (
 )
 POLICIES = (INK, "#687181", TRANSFERABLE[0], "#8458b3", "#a3461c", "#12736b", "#8c6d1f", "#a03a72")
 """Colors of learning curves, ours first. Curves are named in their colors, so each has a contrast of 4.5 to white."""
+TRAINING = ("#12736b", "#8458b3")
+"""Colors of a discriminator's accuracy on demonstrations and on the policy's transitions."""
 DASHES = ("solid", "solid", (0, (5, 3)), (0, (1, 1.5)))
 MARKERS = (("o", "●"), ("s", "■"), ("^", "▲"), ("D", "◆"), ("v", "▼"), ("P", "✚"))
 """Markers of Matplotlib and the characters that stand for them in a legend."""
@@ -111,6 +113,20 @@ class PolicyResult:
     title: str
     curve: LearningCurve | None
     final: Evaluation | None
+
+
+@dataclass(frozen=True)
+class Training:
+    """Metrics of one adversarial training, each (M,) and NaN where it was not measured."""
+
+    title: str
+    env_steps: NDArray[np.float64]
+    demonstration_accuracy: NDArray[np.float64]
+    """Share of demonstrated transitions that the discriminator takes for demonstrated."""
+    policy_accuracy: NDArray[np.float64]
+    """Share of the policy's transitions that the discriminator takes for the policy's."""
+    env_return: NDArray[np.float64]
+    """Mean true return of the episodes of training, with sampled actions."""
 
 
 def contrast(one: str, other: str) -> float:
@@ -255,7 +271,7 @@ def convergence(histories: dict[int, ScoreHistory], colors: dict[int, str]) -> M
             axes.set_title(f"N = {scores.shape[1]}", loc="right", fontsize=7.5, color=MUTED)
             _score_axis(axes, highest, note=False)
             _steps_axis(axes, 4)
-        figure.supxlabel("environment steps of the cluster's job", fontsize=8.5, color=MUTED)
+        figure.supxlabel("environment steps of the cluster's imitator", fontsize=8.5, color=MUTED)
         panels[0, 0].set_ylabel("transferability")
     return Markup(svg.getvalue())
 
@@ -292,6 +308,44 @@ def learning(policies: list[PolicyResult]) -> Markup:
         axes.yaxis.set_major_formatter(FuncFormatter(_tick))
         axes.set_xlabel("environment steps")
         axes.set_ylabel("return")
+    return Markup(svg.getvalue())
+
+
+def trainings(panels: list[Training]) -> Markup:
+    """Draw each training in a column: the accuracy of its discriminator on either side, and below it the return."""
+    columns = min(len(panels), 5)
+    rows = -(-len(panels) // columns)
+    with _drawing("trainings", 11, 0.5 + 2.9 * rows) as (figure, svg):
+        grid = figure.subplots(2 * rows, columns, squeeze=False, sharex=True, gridspec_kw={"wspace": 0.07})
+        finite = [each.env_return[np.isfinite(each.env_return)] for each in panels]
+        low, high = (reach(np.concatenate([[0.0], *finite])) for reach in (np.min, np.max))
+        for i in range(rows * columns):
+            accuracy, returns = (grid[2 * (i // columns) + below, i % columns] for below in (0, 1))
+            if i >= len(panels):
+                accuracy.set_visible(False)
+                returns.set_visible(False)
+                continue
+            panel = panels[i]
+            sides = ((panel.demonstration_accuracy, TRAINING[0], "-"), (panel.policy_accuracy, TRAINING[1], "--"))
+            for values, color, dashes in sides:
+                known = np.isfinite(values)
+                accuracy.plot(panel.env_steps[known], values[known], color=color, linewidth=1.3, linestyle=dashes)
+            accuracy.set_title(panel.title, fontweight="bold")
+            accuracy.set(ylim=(-0.03, 1.03), yticks=(0, 0.5, 1))
+            known = np.isfinite(panel.env_return)
+            returns.plot(panel.env_steps[known], panel.env_return[known], color=INK, linewidth=1.3)
+            returns.set_ylim(low, high * 1.05 or 1)
+            returns.yaxis.set_major_locator(MaxNLocator(4))
+            returns.yaxis.set_major_formatter(FuncFormatter(_tick))
+            returns.tick_params(labelbottom=True)
+            _steps_axis(returns, 4)
+            if i % columns:
+                accuracy.tick_params(labelleft=False)
+                returns.tick_params(labelleft=False)
+            else:
+                accuracy.set_ylabel("accuracy")
+                returns.set_ylabel("return")
+        figure.supxlabel("environment steps of the training", fontsize=8.5, color=MUTED)
     return Markup(svg.getvalue())
 
 

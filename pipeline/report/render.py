@@ -15,6 +15,7 @@ from oodil.pipeline.report import figures, formats, summary
 from oodil.pipeline.report.figures import PolicyResult
 from oodil.pipeline.report.sources import Source, Sources
 from oodil.pipeline.report.summary import Card, Findings, Note
+from oodil.pipeline.report.trainings import read_trainings
 from oodil.pipeline.results import Assignment, ClusterDiagnostics, Transferability
 from oodil.pipeline.runs import RunResults
 
@@ -102,6 +103,14 @@ class ClusterSection:
 
 
 @dataclass(frozen=True)
+class TrainingSection:
+    """How some adversarial trainings went."""
+
+    title: str
+    figure: Markup
+
+
+@dataclass(frozen=True)
 class StageRow:
     """A stage in the table of stages."""
 
@@ -130,6 +139,7 @@ class Report:
     weightings: tuple[WeightingSection, ...]
     mixture: Mixture | None
     clusters: ClusterSection | None
+    trainings: tuple[TrainingSection, ...]
     stages: tuple[StageRow, ...]
     versions: str
     config: str
@@ -162,6 +172,9 @@ def context(results: RunResults) -> Report:
             if sources and assignment and found.diagnostics
             else None
         ),
+        trainings=tuple(
+            TrainingSection(title, figures.trainings(panels)) for title, panels in read_trainings(results).items()
+        ),
         stages=tuple(_stages(results)),
         versions=_versions(results),
         config=yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True),
@@ -179,6 +192,7 @@ def _environment() -> jinja2.Environment:
     )
     environment.filters |= {each.__name__: each for each in (formats.plural, formats.returned, formats.percent)}
     environment.filters["steps"] = formats.count
+    environment.globals["training_colors"] = figures.TRAINING
     return environment
 
 

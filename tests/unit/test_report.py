@@ -2,14 +2,17 @@
 
 import json
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from oodil.pipeline import stage as stage_module
 from oodil.pipeline.artifacts import Files, RunDirectory, write_artifact
@@ -21,6 +24,7 @@ from oodil.pipeline.report import Report, context, summary, write_report
 from oodil.pipeline.report.figures import MUTED, POLICIES, contrast, source_looks
 from oodil.pipeline.report.sources import Source, Sources, ranks_demonstrations
 from oodil.pipeline.report.summary import Findings
+from oodil.pipeline.report.trainings import read_trainings
 from oodil.pipeline.results import (
     Assignment,
     ClusterDiagnostics,
@@ -556,6 +560,54 @@ def test_unstable_clusters_are_called_out(tmp_path: Path) -> None:
     assert "clusters are unstable" in notes(run) and "41 %" in notes(run)
 
 
+@pytest.fixture
+def reader_of_metrics(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in for the reader of metrics."""
+
+    def read_metrics(path: Path) -> dict[str, NDArray]:
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        names = dict.fromkeys(name for row in rows for name in row)
+        return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
+
+    module = ModuleType("oodil.pipeline.metrics")
+    module.read_metrics = read_metrics  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+
+
+def write_metrics(run: Run, stage: str, job: str, rows: list[dict[str, float]]) -> None:
+    """Write the metrics of a job, as its process does."""
+    path = run.directory.path / "metrics" / stage / f"{job}.jsonl"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+@pytest.mark.usefixtures("reader_of_metrics")
+def test_trainings_are_drawn_where_there_are_metrics(tmp_path: Path) -> None:
+    run = full_run(tmp_path, **SMALL)
+    assert "How the trainings went" not in render(run).text
+    rows = [
+        {"step": 1000.0 * i, "demonstration_accuracy": 0.9, "policy_accuracy": 1 - 0.1 * i}
+        | ({"return": 100.0 * i} if i else {})  # no episode has ended yet
+        for i in range(4)
+    ]
+    write_metrics(run, "imitators", "cluster-1", rows)
+    write_metrics(run, "imitators", "cluster-0", rows[:1])  # too short for a curve
+    write_metrics(run, "imitators", "cluster-7", rows)  # of an earlier clustering
+    write_metrics(run, "naive_gail", "naive_gail", [row | {"return": float("nan")} for row in rows])
+    write_metrics(run, "clustering", "clustering", [{"step": 1.0, "loss": 2.0}, {"step": 2.0, "loss": 1.0}])
+    trainings = read_trainings(RunResults(run))
+    assert {group: [each.title for each in held] for group, held in trainings.items()} == {
+        "imitators": ["cluster 1"],
+        "policies": ["naive GAIL"],
+    }
+    drawn = trainings["imitators"][0]
+    np.testing.assert_allclose(drawn.policy_accuracy, [1.0, 0.9, 0.8, 0.7])
+    np.testing.assert_array_equal(drawn.env_return, [np.nan, 100.0, 200.0, 300.0])
+    page = render(run)
+    assert "How the trainings went" in page.text
+    assert page.tags.count("svg") == 6
+
+
 def small_sources(scores: list[float]) -> tuple[Sources, Transferability]:
     """Return one demonstration of 6 transitions of a source, and two of 1 transition of another."""
     looks = source_looks([True, False])
@@ -616,7 +668,7 @@ def test_no_line_names_a_file_or_a_key_of_an_artifact() -> None:
     import oodil.pipeline.report
 
     code = "".join(path.read_text() for path in Path(oodil.pipeline.report.__file__).parent.glob("*.py"))
-    assert ".safetensors" not in code and ".json" not in code
+    assert not re.search(r"\.(safetensors|json)\b", code)
     assert not re.search(r"\b(imitation|naive_gail|oracle|marks|imitators)\b[\"']", code)
 
 
