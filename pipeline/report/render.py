@@ -233,7 +233,7 @@ def _weighting(found: Findings, sources: Sources, name: str) -> WeightingSection
 
 
 def _mixture(found: Findings, sources: Sources) -> Mixture:
-    only = len(found.weightings) == 1
+    only = len(found.results.weightings) == 1
     unweighted = sources.shares(np.ones(len(sources.demonstrations)))
     shares = {"unweighted": unweighted}
     columns = ["return in its own dynamics", "share, unweighted"]

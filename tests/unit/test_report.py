@@ -502,6 +502,7 @@ def test_stale_stages_are_not_shown_and_named_with_the_reason(tmp_path: Path) ->
     assert "Missing: transferability, stale: sharpening 4.0 -> 1.0." in page.text
     assert "Missing: imitation, stale: its input transferability is stale." in page.text
     assert "2,951" not in page.text and "846" in page.text
+    assert "weighting “marks”" in page.text and "weighting “ours”" not in page.text
     Writer(run, 3).demonstrations()
     assert "Missing: clustering, imitators, transferability" not in notes(run), "equal content"
     writer = Writer(run, 3)
