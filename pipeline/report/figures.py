@@ -1,7 +1,8 @@
-"""The figures of the report, each as one SVG element. They hold no text of the user, so the page brings the legends.
+"""The figures of the report, each one SVG element. Labels of sources stand in legends on the page, not in figures.
 
-Sources keep one color and one marker throughout: blues can be reproduced by the imitator, oranges cannot, so the eye
-sees at once whether the two were told apart. Blue and orange stay apart in every common form of color blindness.
+A source has the same color and marker in every figure: blue if it is marked transferable, orange if it is marked not
+transferable. Blue and orange differ in every common form of color blindness.
+
 Letters: N demonstrations, K clusters, E embedding, M points of a curve.
 """
 
@@ -14,6 +15,7 @@ from typing import Any
 
 import matplotlib.style
 import numpy as np
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
@@ -23,11 +25,15 @@ from sklearn.decomposition import PCA
 from sklearn.manifold import TSNE
 from threadpoolctl import threadpool_limits
 
-INK, MUTED, GRID = "#1c2430", "#6a7383", "#e6e9ee"
+from oodil.pipeline.algorithms.weights import transferability_of_logits
+from oodil.pipeline.report.formats import count
+from oodil.pipeline.results import Evaluation, LearningCurve, ScoreHistory
+
+INK, MUTED, GRID = "#1c2430", "#687181", "#e6e9ee"
 
 TRANSFERABLE = ("#1f5fa8", "#45b0d8", "#12837a", "#8aa9e8", "#123a63")
-NOT_TRANSFERABLE = ("#cf4f1b", "#f2a63b", "#8c3310", "#ec8577", "#b58a12")
-UNKNOWN = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#4b5563", "#b3a400")
+NOT_TRANSFERABLE = ("#c84a17", "#f2a63b", "#8c3310", "#ec8577", "#b58a12")
+UNKNOWN = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#c05200", "#4b5563", "#b3a400")
 CLUSTERS = (
     "#2f7d4f",
     "#8458b3",
@@ -40,15 +46,20 @@ CLUSTERS = (
     "#20463a",
     "#7a5c3e",
 )
+POLICIES = (INK, "#687181", TRANSFERABLE[0], "#8458b3", "#a3461c", "#12736b", "#8c6d1f", "#a03a72")
+"""Colors of learning curves, ours first. Curves are named in their colors, so each has a contrast of 4.5 to white."""
+TRAINING = ("#12736b", "#8458b3")
+"""Colors of a discriminator's accuracy on demonstrations and on the policy's transitions."""
+DASHES = ("solid", "solid", (0, (5, 3)), (0, (1, 1.5)))
 MARKERS = (("o", "●"), ("s", "■"), ("^", "▲"), ("D", "◆"), ("v", "▼"), ("P", "✚"))
 """Markers of Matplotlib and the characters that stand for them in a legend."""
 
 FEWEST_FOR_TSNE, MOST_FOR_TSNE = 30, 2500
 PERPLEXITY = 8.0
-"""Below the size of the smallest sources that matter: the paper's rarest have ten demonstrations, and the usual 30
-shrinks them to a dot."""
+"""Less than the size of the smallest source: the paper's have ten demonstrations, which a perplexity of 30 draws as
+one dot."""
 MOST_AS_VECTORS = 3000
-"""Above this, dots are drawn as a picture inside the SVG, which would otherwise take megabytes."""
+"""With more demonstrations, dots become a bitmap inside the SVG; as vectors they would take megabytes."""
 
 STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
@@ -91,23 +102,47 @@ class Look:
 
     @property
     def text(self) -> str:
-        """The color of text on this color."""
-        red, green, blue = (int(self.color[i : i + 2], 16) for i in (1, 3, 5))
-        return "#fff" if 0.299 * red + 0.587 * green + 0.114 * blue < 140 else INK
+        """The color of text on this color: white or ink, whichever has the higher contrast."""
+        return max(("#ffffff", INK), key=lambda text: contrast(text, self.color))
 
 
 @dataclass(frozen=True)
-class Curve:
-    """A learning curve: (M,) environment steps, mean returns and their standard deviations over episodes."""
+class PolicyResult:
+    """What is drawn of a policy."""
 
-    name: str
+    title: str
+    curve: LearningCurve | None
+    final: Evaluation | None
+
+
+@dataclass(frozen=True)
+class Training:
+    """Metrics of one adversarial training, each (M,) and NaN where it was not measured."""
+
+    title: str
     env_steps: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    std: NDArray[np.float64]
+    demonstration_accuracy: NDArray[np.float64]
+    """Share of demonstrated transitions that the discriminator takes for demonstrated."""
+    policy_accuracy: NDArray[np.float64]
+    """Share of the policy's transitions that the discriminator takes for the policy's."""
+    env_return: NDArray[np.float64]
+    """Mean true return of the episodes of training, with sampled actions."""
+
+
+def contrast(one: str, other: str) -> float:
+    """Return the contrast of two colors by WCAG 2, from 1 to 21; small text needs 4.5."""
+    low, high = sorted((_luminance(one), _luminance(other)))
+    return (high + 0.05) / (low + 0.05)
+
+
+def _luminance(color: str) -> float:
+    channels = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    red, green, blue = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
 def source_looks(transferable: Iterable[bool | None]) -> list[Look]:
-    """Return one look per source; a marker changes when the colors of its family are used up."""
+    """Return one look per source; the next marker is used when all colors of a family are taken."""
     transferable = list(transferable)
     families = {True: TRANSFERABLE, False: NOT_TRANSFERABLE, None: UNKNOWN}
     if set(transferable) != {None}:
@@ -123,7 +158,7 @@ def source_looks(transferable: Iterable[bool | None]) -> list[Look]:
 
 
 def project(features: NDArray[np.float32]) -> tuple[NDArray[np.float64], str] | None:
-    """Return (N, 2) points for (N, E) features and the name of the projection; None when there is nothing to see."""
+    """Return (N, 2) points for (N, E) features and the name of the projection; None for features that are all equal."""
     if (
         len(features) < 3
         or features.size == 0
@@ -132,7 +167,7 @@ def project(features: NDArray[np.float32]) -> tuple[NDArray[np.float64], str] | 
     ):
         return None
     features = features.astype(np.float64)
-    # One thread: sums over several would differ in their last bits from run to run, and t-SNE would magnify them.
+    # One thread: the order of sums over several threads changes their last bits, which t-SNE amplifies.
     with threadpool_limits(1):
         if FEWEST_FOR_TSNE <= len(features) <= MOST_FOR_TSNE:
             tsne = TSNE(perplexity=PERPLEXITY, init="pca", learning_rate="auto", random_state=0)
@@ -143,8 +178,8 @@ def project(features: NDArray[np.float32]) -> tuple[NDArray[np.float64], str] | 
 
 def embedding(
     points: NDArray[np.float64], clusters: NDArray[np.int32], sources: NDArray[np.int32], looks: list[Look]
-) -> str:
-    """Draw (N, 2) points twice: by cluster (N,), each marked with its number, and by source (N,)."""
+) -> Markup:
+    """Draw (N, 2) points twice: in the colors of their clusters (N,), which are numbered, and of their sources (N,)."""
     size = float(np.clip(6000 / len(points), 7, 60))
     with _drawing("embedding", 11, 5.0) as (figure, svg):
         left, right = figure.subplots(1, 2, gridspec_kw={"wspace": 0.03})
@@ -167,11 +202,11 @@ def embedding(
             )  # fmt: skip
         for i in _largest_first(sources):
             _dots(right, points[sources == i], looks[i].color, looks[i].marker, size, len(points))
-    return svg.getvalue()
+    return Markup(svg.getvalue())
 
 
-def transferability(scores: NDArray[np.float64], sources: NDArray[np.int32], looks: list[Look]) -> str:
-    """Draw the (N,) scores from the highest to the lowest, colored by source (N,); beside it a column per source."""
+def transferability(scores: NDArray[np.float64], sources: NDArray[np.int32], looks: list[Look]) -> Markup:
+    """Draw the scores (N,) from the highest to the lowest, colored by source (N,), and a column for each source."""
     order = np.argsort(-scores, kind="stable")
     rank = np.empty(len(scores))
     rank[order] = np.arange(1, len(scores) + 1)
@@ -196,37 +231,39 @@ def transferability(scores: NDArray[np.float64], sources: NDArray[np.int32], loo
         axes.set_ylabel("transferability")
         if several:
             _columns(panels[1], scores, sources, looks, size)
-    return svg.getvalue()
+    return Markup(svg.getvalue())
 
 
 def _columns(
     axes: Axes, scores: NDArray[np.float64], sources: NDArray[np.int32], looks: list[Look], size: float
 ) -> None:
-    """Draw one column of dots per source, in the legend's order, with a line at its mean."""
+    """Draw one column of dots per source, in the order of the legend, with a line at the mean."""
     axes.set(xticks=[], xlim=(-0.6, len(looks) - 0.4))
     axes.set_xlabel("by source, line at the mean")
     for i, look in enumerate(looks):
         mine = scores[sources == i]
         if not len(mine):
             continue
-        spread = (np.arange(len(mine)) * 0.618034) % 1.0 - 0.5  # evenly spread whatever their number, and always alike
+        spread = (np.arange(len(mine)) * 0.618034) % 1.0 - 0.5  # golden ratio: even for any count
         x = i + 0.6 * spread * min(1.0, len(mine) / 30)
         _dots(axes, np.stack([x, mine], axis=1), look.color, look.marker, 0.7 * size, len(scores))
         axes.hlines(mine.mean(), i - 0.42, i + 0.42, color=INK, linewidth=1.6, zorder=4)
 
 
-def convergence(histories: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]], colors: dict[int, str]) -> str:
-    """Draw one panel per cluster: (M,) environment steps and (M, N_k) scores, as mean and 10 to 90 % band."""
+def convergence(histories: dict[int, ScoreHistory], colors: dict[int, str]) -> Markup:
+    """Draw the scores of each cluster over environment steps in a panel: their mean and 10 to 90 % band."""
+    curves = {k: transferability_of_logits(history.logits) for k, history in histories.items()}
     columns = min(len(histories), 5)
     rows = -(-len(histories) // columns)
-    highest = max(float(scores.max()) for _, scores in histories.values())
+    highest = max(float(scores.max()) for scores in curves.values())
     with _drawing("convergence", 11, 0.75 + 1.75 * rows) as (figure, svg):
         panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False, gridspec_kw={"wspace": 0.07})
         for axes in panels.flat[len(histories) :]:
             axes.set_visible(False)
         for axes in panels.flat[: len(histories)][-columns:]:
             axes.tick_params(labelbottom=True)
-        for axes, (k, (env_steps, scores)) in zip(panels.flat, histories.items(), strict=False):
+        for axes, (k, scores) in zip(panels.flat, curves.items(), strict=False):
+            env_steps = histories[k].env_steps
             low, high = np.quantile(scores, (0.1, 0.9), axis=1)
             axes.fill_between(env_steps, low, high, color=colors[k], alpha=0.22, linewidth=0)
             axes.plot(env_steps, scores.mean(axis=1), color=colors[k], linewidth=1.8)
@@ -234,40 +271,86 @@ def convergence(histories: dict[int, tuple[NDArray[np.float64], NDArray[np.float
             axes.set_title(f"N = {scores.shape[1]}", loc="right", fontsize=7.5, color=MUTED)
             _score_axis(axes, highest, note=False)
             _steps_axis(axes, 4)
-        figure.supxlabel("environment steps of the cluster's job", fontsize=8.5, color=MUTED)
+        figure.supxlabel("environment steps of the cluster's imitator", fontsize=8.5, color=MUTED)
         panels[0, 0].set_ylabel("transferability")
-    return svg.getvalue()
+    return Markup(svg.getvalue())
 
 
-def learning(ours: Curve | None, naive: Curve | None, oracle_return: float | None) -> str:
-    """Draw true returns over environment steps, with a band of one standard deviation over episodes."""
+def learning(policies: list[PolicyResult]) -> Markup:
+    """Draw true returns over environment steps, with a band of one standard deviation over episodes.
+
+    A policy without a curve is a line at its final return. Policies without finite returns are left out.
+    """
     with _drawing("learning", 11, 3.7) as (figure, svg):
         axes = figure.subplots()
         ends: list[tuple[float, str, str]] = []
-        for curve, color, width in ((naive, "#98a0ad", 1.8), (ours, INK, 2.4)):
-            if curve is None:
-                continue
-            low, high = curve.mean - curve.std, curve.mean + curve.std
-            axes.fill_between(curve.env_steps, low, high, color=color, alpha=0.16, linewidth=0)
-            axes.plot(curve.env_steps, curve.mean, color=color, linewidth=width, marker="o", markersize=3.2)
-            ends.append((float(curve.mean[-1]), curve.name, color))
-        if oracle_return is not None:
-            axes.axhline(oracle_return, color=TRANSFERABLE[0], linewidth=1.4, linestyle=(0, (5, 3)))
-            ends.append((oracle_return, "oracle", TRANSFERABLE[0]))
-        axes.set_xlim(0, max((float(c.env_steps[-1]) for c in (ours, naive) if c is not None), default=1.0) * 1.01)
+        last_step = 0
+        # Ours is drawn last, on top.
+        for i, policy in reversed(list(enumerate(policies))):
+            color, dashes = POLICIES[i % len(POLICIES)], DASHES[min(i, len(DASHES) - 1)]
+            curve, width = policy.curve, 1.8 if i else 2.4
+            if curve is not None and np.isfinite(curve.mean_return).any():
+                low, high = curve.mean_return - curve.std_return, curve.mean_return + curve.std_return
+                axes.fill_between(curve.env_steps, low, high, color=color, alpha=0.13, linewidth=0)
+                axes.plot(
+                    curve.env_steps, curve.mean_return, color=color, linewidth=width, linestyle=dashes,
+                    marker="o", markersize=3.2,
+                )  # fmt: skip
+                ends.append((float(curve.mean_return[np.isfinite(curve.mean_return)][-1]), policy.title, color))
+                last_step = max(last_step, int(curve.env_steps[-1]))
+            elif policy.final is not None and np.isfinite(policy.final.mean_return):
+                axes.axhline(policy.final.mean_return, color=color, linewidth=width, linestyle=dashes)
+                ends.append((policy.final.mean_return, policy.title, color))
+        axes.set_xlim(0, (last_step or 1) * 1.01)
         axes.set_ylim(bottom=min(0, axes.get_ylim()[0]))
         _name_lines(axes, ends)
         _steps_axis(axes, 8)
-        axes.yaxis.set_major_formatter(
-            FuncFormatter(lambda value, _: f"{value:,.0f}" if abs(value) >= 10 else f"{value:g}")
-        )
+        axes.yaxis.set_major_formatter(FuncFormatter(_tick))
         axes.set_xlabel("environment steps")
         axes.set_ylabel("return")
-    return svg.getvalue()
+    return Markup(svg.getvalue())
+
+
+def trainings(panels: list[Training]) -> Markup:
+    """Draw each training in a column: the accuracy of its discriminator on either side, and below it the return."""
+    columns = min(len(panels), 5)
+    rows = -(-len(panels) // columns)
+    with _drawing("trainings", 11, 0.5 + 2.9 * rows) as (figure, svg):
+        grid = figure.subplots(2 * rows, columns, squeeze=False, sharex=True, gridspec_kw={"wspace": 0.07})
+        finite = [each.env_return[np.isfinite(each.env_return)] for each in panels]
+        low, high = (reach(np.concatenate([[0.0], *finite])) for reach in (np.min, np.max))
+        for i in range(rows * columns):
+            accuracy, returns = (grid[2 * (i // columns) + below, i % columns] for below in (0, 1))
+            if i >= len(panels):
+                accuracy.set_visible(False)
+                returns.set_visible(False)
+                continue
+            panel = panels[i]
+            sides = ((panel.demonstration_accuracy, TRAINING[0], "-"), (panel.policy_accuracy, TRAINING[1], "--"))
+            for values, color, dashes in sides:
+                known = np.isfinite(values)
+                accuracy.plot(panel.env_steps[known], values[known], color=color, linewidth=1.3, linestyle=dashes)
+            accuracy.set_title(panel.title, fontweight="bold")
+            accuracy.set(ylim=(-0.03, 1.03), yticks=(0, 0.5, 1))
+            known = np.isfinite(panel.env_return)
+            returns.plot(panel.env_steps[known], panel.env_return[known], color=INK, linewidth=1.3)
+            returns.set_ylim(low, high * 1.05 or 1)
+            returns.yaxis.set_major_locator(MaxNLocator(4))
+            returns.yaxis.set_major_formatter(FuncFormatter(_tick))
+            returns.tick_params(labelbottom=True)
+            _steps_axis(returns, 4)
+            if i % columns:
+                accuracy.tick_params(labelleft=False)
+                returns.tick_params(labelleft=False)
+            else:
+                accuracy.set_ylabel("accuracy")
+                returns.set_ylabel("return")
+        figure.supxlabel("environment steps of the training", fontsize=8.5, color=MUTED)
+    return Markup(svg.getvalue())
 
 
 def _name_lines(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
-    """Write names to the right of the lines' ends, pushed apart where they would touch."""
+    """Write the names of lines beside their last values, moved up where they would overlap."""
     low, high = axes.get_ylim()
     apart = 0.065 * (high - low)
     placed = -np.inf
@@ -280,7 +363,7 @@ def _name_lines(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
 
 
 def _largest_first(sources: NDArray[np.int32]) -> list[int]:
-    """Return the sources so that the rare ones are drawn last, on top."""
+    """Return the sources in the order of drawing: rare ones last, on top."""
     present, counts = np.unique(sources, return_counts=True)
     return [int(i) for i in present[np.argsort(-counts, kind="stable")]]
 
@@ -296,9 +379,9 @@ def _score_axis(axes: Axes, highest: float, note: bool = True) -> None:
     axes.set_ylim(0, max(0.56, min(1.0, highest * 1.06)))
     axes.axhline(0.5, color=MUTED, linewidth=0.8, linestyle=(0, (2, 3)), zorder=1)
     if note:
-        axes.text(
-            1.0, 0.5, "0.5: not to be told from the imitator's own experience", transform=axes.get_yaxis_transform(),
-            ha="right", va="bottom", fontsize=7.5, color=MUTED,
+        axes.annotate(
+            "0.5: indistinguishable from the imitator", (1.0, 0.5), xytext=(0, 2), textcoords="offset points",
+            xycoords=axes.get_yaxis_transform(), ha="right", va="bottom", fontsize=7.5, color=MUTED,
         )  # fmt: skip
 
 
@@ -307,19 +390,15 @@ def _steps_axis(axes: Axes, bins: int) -> None:
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: count(value)))
 
 
-def count(value: float) -> str:
-    """Return a number of steps in a few characters, such as 2.5 M."""
-    for unit, name in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
-        if abs(value) >= unit:
-            return f"{value / unit:.3g}{name}"
-    return f"{value:.0f}"
+def _tick(value: float, _: int) -> str:
+    return f"{value:,.0f}" if abs(value) >= 10 else f"{value:g}"
 
 
 @contextmanager
 def _drawing(name: str, width: float, height: float) -> Iterator[tuple[Figure, io.StringIO]]:
-    """Open a figure in the report's style; on leaving, its SVG element stands in the text that came with it.
+    """Open a figure in the report's style and a text that holds its SVG element once the block ends.
 
-    Equal content gives equal bytes: identifiers are salted with the figure's name, and no date is written.
+    Equal content gives equal bytes: the figure's name salts all identifiers, and the SVG has no date.
     """
     with matplotlib.style.context(["default", STYLE | {"svg.hashsalt": name}]):
         figure = Figure(figsize=(width, height), layout="constrained")
@@ -330,5 +409,5 @@ def _drawing(name: str, width: float, height: float) -> Iterator[tuple[Figure, i
         figure.savefig(drawn, format="svg", dpi=200, metadata={"Date": None})
     element = drawn.getvalue()
     element = re.sub(r"<metadata>.*?</metadata>", "", element[element.index("<svg") :], flags=re.DOTALL)
-    # Group identifiers (axes_1, ...) recur in every figure and nothing refers to them.
+    # Identifiers of groups (axes_1, ...) repeat in every figure, and nothing refers to them.
     svg.write(re.sub(r'(<g) id="[^"]*"', r"\1", element).strip())

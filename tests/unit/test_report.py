@@ -2,21 +2,43 @@
 
 import json
 import re
+import sys
+from collections.abc import Callable
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from oodil.pipeline.artifacts import Artifact, RunDirectory, encode_arrays, encode_json, write_artifact
+from oodil.pipeline import stage as stage_module
+from oodil.pipeline.artifacts import Files, RunDirectory, write_artifact
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.loading import parse_config
-from oodil.pipeline.report import write_report
-from oodil.pipeline.report.collection import Collection, Source
-from oodil.pipeline.report.figures import source_looks
-from oodil.pipeline.results import Results, summary
-from oodil.pipeline.stage import Run
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.report import Report, context, summary, write_report
+from oodil.pipeline.report.figures import MUTED, POLICIES, contrast, source_looks
+from oodil.pipeline.report.sources import Source, Sources, ranks_demonstrations
+from oodil.pipeline.report.summary import Findings
+from oodil.pipeline.report.trainings import read_trainings
+from oodil.pipeline.results import (
+    Assignment,
+    ClusterDiagnostics,
+    CollectedDemonstrations,
+    Evaluation,
+    LearningCurve,
+    Policy,
+    ScoreHistory,
+    TrainedImitators,
+    Transferability,
+)
+from oodil.pipeline.runs import RunResults
+from oodil.pipeline.stage import JobContext, Run, register, stage_named
+from oodil.pipeline.stages import PolicyStage, Weighting, stages
 
 VERSIONS = {"numpy": "2.4.1", "torch": "2.13.0", "mujoco": "3.9.0"}
 PAPER = {"gravity 15.0": True, "gravity 9.8": True, "gravity 2.0": False, "gravity 1.0": False}
@@ -24,35 +46,37 @@ VOID = {"area", "base", "br", "col", "embed", "hr", "img", "input", "link", "met
 
 
 def new_run(
-    folder: Path, labels: list[str], counts: list[int], baselines: tuple[str, ...] = ("naive_gail", "oracle")
+    folder: Path,
+    marks: dict[str, bool | None],
+    counts: tuple[int, ...],
+    baselines: tuple[str, ...] = ("naive_gail", "oracle"),
+    **sections: Any,
 ) -> Run:
     """Return a run in which nothing is finished yet."""
     folder.mkdir(exist_ok=True)
-    gail = {"total_steps": 5_000_000}
     sources = [
-        {"label": label, "expert": "experts/any", "count": count, "transferable": n == 0}
-        for n, (label, count) in enumerate(zip(labels, counts, strict=True))
+        {"label": label, "expert": "hand-written", "count": count, "transferable": mark}
+        for (label, mark), count in zip(marks.items(), counts, strict=True)
     ]
     values = {
         "name": "hopper_1_1_25_25",
         "seed": 3,
         "environment": {"id": "oodil/Hopper-v0", "dynamics": {"gravity": 12.0}},
         "demonstrations": {"sources": sources},
-        "transferability": {"gail": gail},
-        "imitation": {"gail": gail},
+        "transferability": {"gail": {"total_steps": 5_000_000}},
+        "imitation": {"gail": {"total_steps": 5_000_000}},
         "baselines": baselines,
     }
-    return Run(parse_config(values, origin="test"), RunDirectory(folder))
+    return Run(parse_config(values | sections, origin="test"), RunDirectory(folder))
 
 
 class Writer:
     """Writes the artifacts of a synthetic run, each a function of the seed, in the order of the stages."""
 
-    def __init__(
-        self, run: Run, transferable: dict[str, bool | None], counts: list[int], num_clusters: int = 5
-    ) -> None:
+    def __init__(self, run: Run, num_clusters: int = 5) -> None:
         self.run = run
-        self.transferable = transferable
+        self.known = [source.transferable for source in run.config.demonstrations.sources]
+        counts = [source.count for source in run.config.demonstrations.sources]
         self.sources = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
         self.num_clusters = num_clusters
         self.rng = np.random.default_rng(0)
@@ -62,156 +86,147 @@ class Writer:
             np.int32
         )
 
-    def write(self, stage: str, files: dict[str, Any], inputs: tuple[str, ...] = ()) -> Artifact:
-        """Write a stage's artifact: dictionaries of arrays become safetensors, everything else JSON."""
-        hashes = {name: self.run.artifact(name).sha256 for name in inputs}
-        encoded = {
-            name: encode_arrays(value) if name.endswith(".safetensors") else encode_json(value)
-            for name, value in files.items()
-        }
-        origin = {"stage": stage, "version": 1, "seed": 3, "settings": {}, "inputs": hashes}
-        return write_artifact(self.run.directory.stage(stage), origin, encoded, VERSIONS)
+    def write(self, stage: str, files: Files) -> None:
+        """Write a stage's artifact, made by this code from what lies in the run."""
+        origin = stage_named(stage).origin(self.run)
+        write_artifact(self.run.directory.stage(stage), origin, files, VERSIONS)
 
     def demonstrations(self) -> None:
         """About ten states each, so that the files stay small; sources differ in their returns."""
-        number = len(self.sources)
-        lengths = self.rng.integers(8, 13, size=number)
-        arrays = {
-            "observations": self.rng.normal(size=(lengths.sum(), 12)).astype(np.float32),
-            "offsets": np.cumsum([0, *lengths]).astype(np.int64),
-            "sources": self.sources,
-            "returns": 3200.0 + 50.0 * self.sources + self.rng.normal(size=number),
-        }
-        described = {
-            "environment": {"id": "oodil/Hopper-v0", "dynamics": {"gravity": 12.0}},
-            "source_labels": list(self.transferable),
-            "transferable": list(self.transferable.values()),
-        }
-        self.write("demonstrations", {"demonstrations.safetensors": arrays, "demonstrations.json": described})
+        lengths = self.rng.integers(8, 13, size=len(self.sources))
+        episodes = [
+            Episode(self.rng.normal(size=(length, 12)), 3200.0 + 50.0 * source)
+            for source, length in zip(self.sources, lengths, strict=True)
+        ]
+        held = replace(
+            Demonstrations.of(episodes, "source 0"),
+            sources=self.sources,
+            source_labels=tuple(f"source {i}" for i in range(len(self.known))),
+        )
+        self.write("demonstrations", CollectedDemonstrations(held, environment_id="oodil/Hopper-v0").files())
 
-    def clustering(self) -> None:
+    def clustering(self, **changed: Any) -> None:
         """Blobs on the unit sphere, one per cluster, with a few strays."""
         centers = self.rng.normal(size=(self.num_clusters, 128))
-        own = np.random.default_rng(1).normal(size=(int(self.sources.max()) + 1, 128))
-        features = (
-            centers[self.labels] + 0.5 * own[self.sources] + 0.75 * self.rng.normal(size=(len(self.sources), 128))
-        )
+        own = np.random.default_rng(1).normal(size=(len(self.known), 128))
+        noise = 0.75 * self.rng.normal(size=(len(self.sources), 128))
+        features = centers[self.labels] + 0.5 * own[self.sources] + noise
         features /= np.linalg.norm(features, axis=1, keepdims=True)
-        sizes = np.bincount(self.labels, minlength=self.num_clusters)
-        contingency = {
-            label: np.bincount(self.labels[self.sources == i], minlength=self.num_clusters).tolist()
-            for i, label in enumerate(self.transferable)
-        }
-        diagnostics = {
-            "num_clusters": self.num_clusters,
-            "non_empty_clusters": int((sizes > 0).sum()),
-            "cluster_sizes": sizes.tolist(),
-            "silhouette": 0.4127,
-            "calinski_harabasz": 231.46,
-            "label_stability": 0.9731,
-            "purity": 0.9673,  # deliberately not what the contingency gives
-            "contingency": contingency,
-        }
-        arrays = {"labels": self.labels, "features": features.astype(np.float32)}
-        self.write(
-            "clustering", {"assignment.safetensors": arrays, "diagnostics.json": diagnostics}, ("demonstrations",)
+        contingency = np.zeros((len(self.known), self.num_clusters), int)
+        np.add.at(contingency, (self.sources, self.labels), 1)
+        diagnostics = ClusterDiagnostics(
+            num_clusters=self.num_clusters,
+            cluster_sizes=tuple(contingency.sum(axis=0).tolist()),
+            label_stability=0.9731,
+            silhouette=0.4127,
+            calinski_harabasz=231.46,
+            purity=0.9673,  # deliberately not what the contingency gives
+            contingency=tuple(map(tuple, contingency.tolist())),
+            shortened_subtrajectories=0,
         )
+        features = changed.pop("features", features).astype(np.float32)
+        files = Assignment(self.labels, features).files() | replace(diagnostics, **changed).files()
+        self.write("clustering", files)
 
-    def scores(self) -> None:
-        """High scores for what is transferable; every curve starts near a half and parts from the others."""
-        known = np.array([value is not False for value in self.transferable.values()])[self.sources]
-        scores = np.where(known, self.rng.beta(22, 42, known.size), self.rng.beta(2, 45, known.size))
-        offsets = self.run.artifact("demonstrations").arrays("demonstrations.safetensors")["offsets"]
-        weights = scores / (scores * (np.diff(offsets) - 1)).sum()
-        history: dict[str, NDArray] = {}
+    def imitators(self) -> None:
+        """What all of them together took."""
+        self.write("imitators", TrainedImitators(5 * 1_500_000, {}).files())
+
+    def scores(self, favored: bool | None = True) -> None:
+        """High scores for what is favored; every curve starts near a half and ends at the scores."""
+        high = np.array([mark in (favored, None) for mark in self.known])[self.sources]
+        scores = np.where(high, self.rng.beta(22, 42, high.size), self.rng.beta(2, 45, high.size))
+        history = {}
         progress = np.linspace(0.0, 1.0, 40)[:, None]
-        for k in np.unique(self.labels):
+        steps = np.linspace(0, 1_500_000, 40).astype(np.int64)
+        for k in np.unique(self.labels).tolist():
             members = np.flatnonzero(self.labels == k)
             end = scores[members][None]
-            noise = 0.02 * self.rng.normal(size=(40, members.size)) + 0.01 * self.rng.normal(size=(40, 1))
-            curve = (
-                end
-                + (0.45 - end) * np.exp(-6 * progress)
-                - 0.5 * end * np.exp(-((progress - 0.25) ** 2) / 0.02)
-                + noise
-            )
-            history[f"cluster_{k}/env_steps"] = np.linspace(0, 1_500_000, 40).astype(np.int64)
-            history[f"cluster_{k}/scores"] = np.clip(curve, 0.001, 0.999)
-            history[f"cluster_{k}/demonstrations"] = members
-        mean_scores = {label: float(scores[self.sources == i].mean()) for i, label in enumerate(self.transferable)}
-        described = {
-            "auroc": 0.9871,  # deliberately not what the scores give
-            "transferable_share": 0.5312,
-            "transferable_share_before": 0.0391,
-            "mean_score_by_source": mean_scores,
-            "sharpening": 1.0,
-            "env_steps": 5 * 1_500_000,
-        }
-        arrays = {"scores": scores, "weights": weights, "clusters": self.labels}
+            seen = end + (0.45 - end) * np.exp(-6 * progress)
+            history[k] = ScoreHistory(members, steps, np.log(1 / seen - 1))
         self.write(
-            "transferability",
-            {
-                "transferability.safetensors": arrays,
-                "history.safetensors": history,
-                "summary.json": described,
-            },
-            ("demonstrations", "clustering"),
+            "transferability", Transferability(scores, scores / scores.sum(), self.labels, 20_000, history).files()
         )
 
-    def policy(
-        self, stage: str, final_return: float, inputs: tuple[str, ...], episodes: int = 32, env_steps: int = 5_000_000
-    ) -> None:
+    def marks(self) -> None:
+        """One or zero."""
+        scores = np.array([mark is True for mark in self.known], np.float64)[self.sources]
+        none = np.full(len(scores), -1, np.int32)
+        self.write("marks", Transferability(scores, scores / max(scores.sum(), 1), none).files())
+
+    def policy(self, stage: str, mean: float, episodes: int = 32, env_steps: int = 5_000_000, points: int = 12) -> None:
         """A learning curve that ends near the final return."""
-        steps = np.linspace(400_000, env_steps, 12)
-        mean = final_return * (1 - np.exp(-steps / 1.4e6)) + 60 * self.rng.normal(size=12)
-        evaluation = {
-            "final_return": final_return,
-            "final_return_std": 0.08 * final_return,
-            "final_length": 968.2,
-            "episodes": episodes,
-            "env_steps": env_steps,
+        steps = np.linspace(400_000, env_steps, points).astype(np.int64)
+        curve = LearningCurve(
+            env_steps=steps,
+            mean_return=mean * (1 - np.exp(-steps / 1.4e6)) + 60 * self.rng.normal(size=points),
+            std_return=np.full(points, 210.0),
+            mean_length=np.full(points, 968.0),
+            episodes=7,
+        )
+        returns = mean + 0.08 * mean * np.where(np.arange(episodes) % 2, 1, -1)  # their mean is exactly ``mean``
+        final = Evaluation(returns, np.full(episodes, 968))
+        policy = Policy(
+            gaussian=GaussianPolicy(
+                weights=(np.zeros((12, 3), np.float32),),
+                biases=(np.zeros(3, np.float32),),
+                log_std=np.zeros(3, np.float32),
+                input_mean=np.zeros(12, np.float32),
+                input_scale=np.ones(12, np.float32),
+            ),
+            environment_id="oodil/Hopper-v0",
+            observation_shape=(12,),
+            action_low=-np.ones(3, np.float32),
+            action_high=np.ones(3, np.float32),
+            env_steps=env_steps,
+        )
+        self.write(stage, policy.files() | curve.files() | final.files())
+
+    def steps(self) -> dict[str, Callable[[], None]]:
+        """Return what writes each stage, in their order."""
+        return {
+            "demonstrations": self.demonstrations,
+            "clustering": self.clustering,
+            "imitators": self.imitators,
+            "transferability": self.scores,
+            "imitation": lambda: self.policy("imitation", 2951.4),
+            "naive_gail": lambda: self.policy("naive_gail", 846.3),
+            "marks": self.marks,
+            "oracle": lambda: self.policy("oracle", 3127.8),
         }
-        curve = {"env_steps": steps.tolist(), "return_mean": mean.tolist(), "return_std": np.full(12, 210.0).tolist()}
-        self.write(stage, {"evaluation.json": evaluation, "curve.json": curve, "policy.json": {}}, inputs)
 
     def events(self) -> None:
-        """The log, with things in it that a reader has to pass over."""
+        """The log, with lines that a reader has to pass over."""
         stages = {
             "demonstrations": 21.4,
             "clustering": 48.9,
-            "transferability": 402.0,
+            "imitators": 402.0,
             "imitation": 263.1,
             "naive_gail": 259.8,
         }
         lines = [{"time": 1.7e9, "event": "run_started", "workers": 2}, {"time": 1.7e9, "event": "something_new"}]
-        lines += [
-            {"time": 1.7e9, "event": "stage_finished", "stage": s, "seconds": t, "workers": 2}
-            for s, t in stages.items()
-        ]
+        lines += [{"time": 1.7e9, "event": "stage_finished", "stage": s, "seconds": t} for s, t in stages.items()]
         text = "".join(json.dumps(line) + "\n" for line in lines) + '[1, 2]\n{"event": "stage_fin'
         self.run.directory.events.write_text(text)
 
 
 def full_run(
     folder: Path,
-    transferable: dict[str, Any] = PAPER,
+    marks: dict[str, Any] = PAPER,
     counts: tuple[int, ...] = (10, 10, 250, 250),
     num_clusters: int = 5,
 ) -> Run:
     """Return a run in which everything is finished."""
-    run = new_run(folder, list(transferable), list(counts))
-    writer = Writer(run, transferable, list(counts), num_clusters)
-    writer.demonstrations()
-    writer.clustering()
-    writer.scores()
-    writer.policy("imitation", 2951.4, ("demonstrations", "transferability"))
-    writer.policy("naive_gail", 846.3, ("demonstrations",))
-    writer.policy("oracle", 3127.8, ("demonstrations",))
+    baselines = ("naive_gail", "oracle") if True in marks.values() else ("naive_gail",)
+    run = new_run(folder, marks, counts, baselines)
+    writer = Writer(run, num_clusters)
+    for stage in stages(run.config):
+        writer.steps()[stage.name]()
     writer.events()
     return run
 
 
-SMALL: dict[str, Any] = {"transferable": {"heavy": True, "light": False}, "counts": (3, 5), "num_clusters": 2}
+SMALL: dict[str, Any] = {"marks": {"heavy": True, "light": False}, "counts": (3, 5), "num_clusters": 2}
 """A run that renders in a moment."""
 
 
@@ -245,7 +260,7 @@ class Page(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         if self.open and self.open[-1] != "style":
-            self.text += data
+            self.text += data.replace("\u00a0", " ")
 
 
 def render(run: Run) -> Page:
@@ -261,6 +276,22 @@ def render(run: Run) -> Page:
     return page
 
 
+def contents(run: Run) -> Report:
+    """Return what the page shows of a run as it lies on disk now."""
+    return context(RunResults(run))
+
+
+def notes(run: Run) -> str:
+    """Return the notes of a run."""
+    told = summary.notes(Findings.of(RunResults(run)))
+    return "\n".join(note.lead + note.text for note in told).replace("\u00a0", " ")
+
+
+def cards(run: Run) -> dict[str, str]:
+    """Return the figures of the cards by title."""
+    return {card.title: card.figure.replace("\u00a0", " ") for card in summary.cards(Findings.of(RunResults(run)))}
+
+
 @pytest.fixture(scope="module")
 def full(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Page]:
     """A finished run of the paper's composition, and its report."""
@@ -268,11 +299,29 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Page]:
     return run, render(run)
 
 
-def test_report_states_the_key_figures_of_the_artifacts(full: tuple[Run, Page]) -> None:
+def test_the_cards_hold_the_key_figures(full: tuple[Run, Page]) -> None:
+    run, page = full
+    separation = RunResults(run).separation()
+    assert cards(run) == {
+        "Final return, ours": "2,951",
+        "Final return, naive GAIL": "846",
+        "Final return, oracle": "3,128",
+        "Transferable share": f"{100 * separation['share']:.0f} %",
+        "AUROC": f"{separation['auroc']:.3f}",
+        "Purity of clusters": "0.967",
+        "Environment steps": "22.5 M",  # 5 x 1.5 M of the imitators, 20 k of their scores, 3 x 5 M of the policies
+        "Time": "16 min 35 s",  # 21.4 + 48.9 + 402.0 + 263.1 + 259.8 = 995.2
+    }
+    assert f"{100 * separation['share_before']:.1f} %→{100 * separation['share']:.0f} %" in page.text
+    assert all(figure in page.text for figure in cards(run).values())
+
+
+def test_the_top_of_the_page_says_what_was_run(full: tuple[Run, Page]) -> None:
     _, page = full
-    for figure in ("2,951", "846", "3,128", "3.9 %→53 %", "0.987", "0.967", "22.5 M", "16 min 35 s"):
-        assert figure in page.text
-    assert "3.5 times" in page.text  # 2951.4 / 846.3 = 3.487
+    # 2951.4 / 846.3 = 3.487 and 2951.4 / 3127.8 = 0.944
+    finding = "The policy “ours” returns 2,951 on average, 3.5 times the return of naive GAIL (846) and "
+    finding += "0.94 times the return of oracle (3,128)."
+    assert finding in page.text
     assert "520 demonstrations of 4 sources" in page.text
     assert "gravity 12" in page.text
     assert "One seed (3)" in page.text
@@ -284,25 +333,80 @@ def test_report_has_every_figure_and_the_source_of_its_numbers(full: tuple[Run, 
     assert page.tags.count("svg") == 4
     for label in ("by cluster", "by source", "cluster 4", "naive GAIL", "oracle", "Calinski-Harabasz 231.5", "t-SNE"):
         assert label in page.text
-    for stage in ("demonstrations", "clustering", "transferability", "imitation", "naive_gail", "oracle"):
+    for stage in RunResults(run).states:
         assert run.artifact(stage).sha256 in page.text
     assert "torch 2.13.0" in page.text
     assert "center_weight: 0.01" in page.text  # of the resolved configuration
 
 
-def test_summary_takes_the_figures_as_written(full: tuple[Run, Page]) -> None:
-    assert summary(full[0]) == pytest.approx(
-        {
-            "final_return": 2951.4,
-            "naive_return": 846.3,
-            "oracle_return": 3127.8,
-            "purity": 0.9673,
-            "auroc": 0.9871,
-            "transferable_share": 0.5312,
-            "env_steps": 5 * 1_500_000 + 3 * 5_000_000,
-            "seconds": 21.4 + 48.9 + 402.0 + 263.1 + 259.8,
-        }
-    )
+def test_episodes_of_a_curve_are_those_that_it_was_made_with(full: tuple[Run, Page]) -> None:
+    run, page = full
+    assert run.config.evaluation.episodes != 7
+    assert "7 episodes per point" in page.text
+
+
+def test_weightings_that_repeat_what_is_known_have_no_figure_of_their_own(full: tuple[Run, Page]) -> None:
+    report = contents(full[0])
+    assert [weighting.title for weighting in report.weightings] == ["ours"]
+    assert report.mixture is not None
+    assert [bar.title for bar in report.mixture.bars] == ["unweighted", "weighting “ours”", "weighting “marks”"]
+    assert sum(share for source, share in report.mixture.bars[2].shares if source.transferable) == pytest.approx(1)
+    assert report.policies is not None
+    assert [(row.title, row.weighting) for row in report.policies.rows] == [
+        ("ours", "ours"),
+        ("naive GAIL", ""),
+        ("oracle", "marks"),
+    ]
+
+
+class LengthWeighting(Weighting):
+    """A method as somebody may register it: long demonstrations weigh more."""
+
+    name = "by_length"
+    title = "by length"
+    version = 1
+    inputs = ("demonstrations",)
+
+    def settings(self, config: RunConfig) -> dict[str, Any]:
+        return {}
+
+    def run_job(self, run: Run, job: str, context: JobContext) -> Files:
+        raise NotImplementedError
+
+    def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
+        raise NotImplementedError
+
+
+def test_a_registered_method_appears(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stage_module, "_REGISTRY", dict(stage_module._REGISTRY))  # forgets them afterwards
+    register(LengthWeighting())
+    register(PolicyStage("longest", title="longest first", weighting=LengthWeighting.name))
+    run = new_run(tmp_path, SMALL["marks"], SMALL["counts"], baselines=("longest",))
+    writer = Writer(run, 2)
+    for name in ("demonstrations", "clustering", "imitators", "transferability", "imitation"):
+        writer.steps()[name]()
+    assert "Missing: by_length, longest, not computed yet." in render(run).text
+    lengths = RunResults(run).demonstrations.lengths
+    none = np.full(len(lengths), -1, np.int32)
+    writer.write("by_length", Transferability(lengths / 20, lengths / lengths.sum(), none).files())
+    writer.policy("longest", 1500.0)
+    page = render(run)
+    assert page.tags.count("svg") == 5
+    for text in ("Weighting “by length”", "weighting “by length”", "Final return, longest first", "AUROC, by length"):
+        assert text in page.text
+    assert "2.0 times the return of longest first (1,500)" in page.text
+    assert "Missing" not in page.text
+
+
+def test_the_contingency_is_by_source_whatever_it_is_called(tmp_path: Path) -> None:
+    run = full_run(tmp_path, **SMALL)
+    renamed = Run(new_run(tmp_path, {"new": True, "name": False}, SMALL["counts"]).config, run.directory)
+    clusters, expected = contents(renamed).clusters, RunResults(run).cluster_diagnostics.contingency
+    assert clusters is not None
+    assert [(row.source.label, tuple(n for n, _ in row.cells)) for row in clusters.contingency] == [
+        ("new", expected[0]),
+        ("name", expected[1]),
+    ]
 
 
 def test_equal_runs_give_equal_bytes(tmp_path: Path) -> None:
@@ -314,31 +418,36 @@ def test_equal_runs_give_equal_bytes(tmp_path: Path) -> None:
     assert reports[0] == reports[1]
 
 
-@pytest.mark.parametrize("finished", range(6))
+@pytest.mark.parametrize("finished", range(9))
 def test_a_partial_run_says_what_is_missing(tmp_path: Path, finished: int) -> None:
-    run = new_run(tmp_path, list(SMALL["transferable"]), list(SMALL["counts"]))
-    writer = Writer(run, **SMALL)
-    steps = (
-        writer.demonstrations,
-        writer.clustering,
-        writer.scores,
-        lambda: writer.policy("imitation", 12.0, ("transferability",)),
-        lambda: writer.policy("naive_gail", -3.5, ("demonstrations",)),
-    )
-    for step in steps[:finished]:
-        step()
-    names = ["demonstrations", "clustering", "transferability", "imitation", "naive GAIL", "oracle"]
-    assert f"Missing: {', '.join(names[finished:])}, not finished." in render(run).text
-    known = ["purity", "auroc", "transferable_share", "final_return", "naive_return"]
-    after_stage = [2, 3, 3, 4, 5]
-    expected = {key for key, stage in zip(known, after_stage, strict=True) if finished >= stage}
-    assert set(summary(run)) == expected | ({"env_steps"} if finished >= 3 else set())
+    run = new_run(tmp_path, SMALL["marks"], SMALL["counts"])
+    writer, names = Writer(run, 2), list(RunResults(run).states)
+    for name in names[:finished]:
+        writer.steps()[name]()
+    page = render(run)
+    if names[finished:]:
+        assert f"Missing: {', '.join(names[finished:])}, not computed yet." in page.text
+    else:
+        assert "Missing" not in page.text
+    assert ("It learns from" in page.text) == (finished >= 1)
+    assert ("not clustered yet" in page.text) == (finished < 2)
+    assert ("not known yet" in page.text) == (finished < 4)
+    assert ("No policy is trained yet" in page.text) == (finished < 5)
+    assert ("returns 2,951 on average" in page.text) == (finished >= 5)
 
 
-def test_a_baseline_that_was_not_asked_for_is_not_missing(tmp_path: Path) -> None:
-    page = render(new_run(tmp_path, ["a"], [3], baselines=()))
-    assert "Missing: demonstrations, clustering, transferability, imitation, not finished." in page.text
-    assert page.text.count("not asked for") == 2
+def test_a_begun_stage_is_not_finished(tmp_path: Path) -> None:
+    run = new_run(tmp_path, SMALL["marks"], SMALL["counts"])
+    run.directory.checkpoints("demonstrations", "source-0").mkdir(parents=True)
+    assert "Missing: demonstrations, not finished." in notes(run)
+
+
+def test_policies_that_were_not_asked_for_are_not_on_the_page(tmp_path: Path) -> None:
+    run = new_run(tmp_path, {"a": True}, (3,), baselines=())
+    page = render(run)
+    states = "demonstrations, clustering, imitators, transferability, imitation"
+    assert f"Missing: {states}, not computed yet." in page.text
+    assert "naive GAIL" not in page.text and "oracle" not in page.text
 
 
 def test_labels_are_escaped(tmp_path: Path) -> None:
@@ -350,7 +459,7 @@ def test_labels_are_escaped(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("transferable", "counts", "num_clusters"),
+    ("marks", "counts", "num_clusters"),
     [
         ({f"robot {i}": [True, False, None][i % 3] for i in range(30)}, (2,) * 30, 12),
         ({"only": None}, (4,), 1),
@@ -366,91 +475,185 @@ def test_labels_are_escaped(tmp_path: Path) -> None:
         "one demonstration",
     ],
 )
-def test_unusual_sets(tmp_path: Path, transferable: dict[str, Any], counts: tuple[int, ...], num_clusters: int) -> None:
-    page = render(full_run(tmp_path, transferable, counts, num_clusters))
+def test_unusual_sets(tmp_path: Path, marks: dict[str, Any], counts: tuple[int, ...], num_clusters: int) -> None:
+    page = render(full_run(tmp_path, marks, counts, num_clusters))
     assert f"{sum(counts)} demonstration" in page.text
-    assert all((label or "unnamed") in page.text for label in transferable)
+    assert all((label or "unnamed") in page.text for label in marks)
 
 
 def test_sources_may_be_unknown_and_features_trivial(tmp_path: Path) -> None:
     run = full_run(tmp_path, {"a": None}, (6,), 1)
-    writer = Writer(run, {"a": None}, [6], 1)
-    observations = run.artifact("demonstrations").arrays("demonstrations.safetensors")
-    writer.write("demonstrations", {"demonstrations.safetensors": observations, "demonstrations.json": {}})
-    trivial = {"labels": np.zeros(6, np.int32), "features": np.zeros((6, 0), np.float32)}
-    diagnostics = {"num_clusters": 1, "purity": None, "silhouette": None}
-    writer.write(
-        "clustering", {"assignment.safetensors": trivial, "diagnostics.json": diagnostics}, ("demonstrations",)
-    )
+    unknown = {"silhouette": None, "calinski_harabasz": None}
+    Writer(run, 1).clustering(features=np.zeros((6, 0)), **unknown)
     page = render(run)
-    assert "6 demonstrations; whose is not known." in page.text
+    assert "It learns from 6 demonstrations." in page.text
     assert "There is no embedding to show" in page.text
-    assert "purity" not in summary(run)
+    assert "Calinski" not in page.text
+    assert "neither AUROC nor the transferable share" in page.text
+    assert "AUROC" not in cards(run)
 
 
-def test_artifacts_of_other_demonstrations_are_not_shown(tmp_path: Path) -> None:
+def test_stale_stages_are_not_shown_and_named_with_the_reason(tmp_path: Path) -> None:
     run = full_run(tmp_path, **SMALL)
-    Writer(run, SMALL["transferable"], [4, 4], 2).demonstrations()
+    changed = new_run(tmp_path, SMALL["marks"], SMALL["counts"], transferability={
+        "gail": {"total_steps": 5_000_000}, "sharpening": 1.0,
+    })  # fmt: skip
+    page = render(changed)
+    assert "Missing: transferability, stale: sharpening 4.0 -> 1.0." in page.text
+    assert "Missing: imitation, stale: its input transferability is stale." in page.text
+    assert "2,951" not in page.text and "846" in page.text
+    assert "weighting “marks”" in page.text and "weighting “ours”" not in page.text
+    Writer(run, 3).demonstrations()
+    assert "Missing: clustering, imitators, transferability" not in notes(run), "equal content"
+    writer = Writer(run, 3)
+    writer.rng = np.random.default_rng(5)
+    writer.demonstrations()
     page = render(run)
-    assert "Missing: clustering, naive GAIL, oracle, out of date, because demonstrations changed" in page.text
-    assert "2,951" not in page.text
-    assert set(summary(run)) == {"seconds"}
+    assert "stale: its input demonstrations changed" in page.text
+    assert "2,951" not in page.text and "846" not in page.text
+    assert "-> " not in page.text
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:
     run = full_run(tmp_path, **SMALL)
-    damaged = run.directory.stage("imitation") / "evaluation.json"
-    damaged.write_text(damaged.read_text().replace("2951.4", "9951.4"))
+    folder = run.directory.stage("imitation")
+    damaged = next(path for path in folder.iterdir() if b'"returns"' in path.read_bytes())
+    damaged.write_text(damaged.read_text().replace("2715.2", "9715.2"))
     page = render(run)
     assert "Missing: imitation, damaged" in page.text
     assert str(damaged) in page.text
-    assert "9,951" not in page.text
-    assert "final_return" not in summary(run)
-    (run.directory.stage("imitation") / "manifest.json").write_text("{")
-    assert "Missing: imitation, damaged" in render(run).text
+    assert summary.finding(Findings.of(RunResults(run))) == ""
+    (folder / "manifest.json").write_text("{")
+    assert "Missing: imitation, damaged" in notes(run)
 
 
 def test_weak_evaluations_are_called_weak(tmp_path: Path) -> None:
     run = full_run(tmp_path, **SMALL)
-    writer = Writer(run, **SMALL)
-    writer.policy("naive_gail", 80.0, ("demonstrations",), episodes=4, env_steps=1_000_000)
-    text = render(run).text
-    assert "Few evaluation episodes (naive GAIL 4)" in text
-    assert "imitation 5 M, naive GAIL 1 M, oracle 5 M environment steps" in text
+    Writer(run, 2).policy("naive_gail", 80.0, episodes=4, env_steps=1_000_000)
+    assert "over few episodes (naive GAIL 4)" in notes(run)
+    assert "(ours 5 M, naive GAIL 1 M, oracle 5 M)" in notes(run)
+
+
+def test_returns_may_be_unknown_negative_or_without_a_curve(tmp_path: Path) -> None:
+    run = full_run(tmp_path, **SMALL)
+    writer = Writer(run, 2)
+    writer.policy("naive_gail", -3.5, points=0)
+    writer.policy("oracle", float("nan"))
+    page = render(run)
+    assert "returns 2,951 on average, against -3.5 of naive GAIL." in page.text
+    assert cards(run)["Final return, oracle"] == "–"
+    assert "naive GAIL" in Page(str(contents(run).policies.figure)).text  # type: ignore[union-attr]
+    writer.policy("imitation", float("nan"))
+    assert "returns 2,951" not in render(run).text
 
 
 def test_scores_that_favor_the_wrong_sources_are_called_out(tmp_path: Path, full: tuple[Run, Page]) -> None:
-    told = "Weighting did not raise the transferable share"
+    told = "The weighting “ours” does not raise the transferable share"
     assert told not in full[1].text
     run = full_run(tmp_path, **SMALL)
-    arrays = run.artifact("transferability").arrays("transferability.safetensors")
-    worse = {"auroc": 0.2, "transferable_share": 0.1, "transferable_share_before": 0.3}
-    files = {"transferability.safetensors": arrays, "summary.json": worse}
-    Writer(run, **SMALL).write("transferability", files, ("demonstrations", "clustering"))
-    assert told in render(run).text
+    Writer(run, 2).scores(favored=False)
+    assert told in notes(run)
+
+
+def test_unstable_clusters_are_called_out(tmp_path: Path) -> None:
+    run = full_run(tmp_path, **SMALL)
+    Writer(run, 2).clustering(label_stability=0.41)
+    assert "clusters are unstable" in notes(run) and "41 %" in notes(run)
+
+
+@pytest.fixture
+def reader_of_metrics(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in for the reader of metrics."""
+
+    def read_metrics(path: Path) -> dict[str, NDArray]:
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        names = dict.fromkeys(name for row in rows for name in row)
+        return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
+
+    module = ModuleType("oodil.pipeline.metrics")
+    module.read_metrics = read_metrics  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+
+
+def write_metrics(run: Run, stage: str, job: str, rows: list[dict[str, float]]) -> None:
+    """Write the metrics of a job, as its process does."""
+    path = run.directory.path / "metrics" / stage / f"{job}.jsonl"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+@pytest.mark.usefixtures("reader_of_metrics")
+def test_trainings_are_drawn_where_there_are_metrics(tmp_path: Path) -> None:
+    run = full_run(tmp_path, **SMALL)
+    assert "How the trainings went" not in render(run).text
+    rows = [
+        {"step": 1000.0 * i, "demonstration_accuracy": 0.9, "policy_accuracy": 1 - 0.1 * i}
+        | ({"return": 100.0 * i} if i else {})  # no episode has ended yet
+        for i in range(4)
+    ]
+    write_metrics(run, "imitators", "cluster-1", rows)
+    write_metrics(run, "imitators", "cluster-0", rows[:1])  # too short for a curve
+    write_metrics(run, "imitators", "cluster-7", rows)  # of an earlier clustering
+    write_metrics(run, "naive_gail", "naive_gail", [row | {"return": float("nan")} for row in rows])
+    write_metrics(run, "clustering", "clustering", [{"step": 1.0, "loss": 2.0}, {"step": 2.0, "loss": 1.0}])
+    trainings = read_trainings(RunResults(run))
+    assert {group: [each.title for each in held] for group, held in trainings.items()} == {
+        "imitators": ["cluster 1"],
+        "policies": ["naive GAIL"],
+    }
+    drawn = trainings["imitators"][0]
+    np.testing.assert_allclose(drawn.policy_accuracy, [1.0, 0.9, 0.8, 0.7])
+    np.testing.assert_array_equal(drawn.env_return, [np.nan, 100.0, 200.0, 300.0])
+    page = render(run)
+    assert "How the trainings went" in page.text
+    assert page.tags.count("svg") == 6
+
+
+def small_sources(scores: list[float]) -> tuple[Sources, Transferability]:
+    """Return one demonstration of 6 transitions of a source, and two of 1 transition of another."""
+    looks = source_looks([True, False])
+    each = (Source("a", True, 1, 5.0, looks[0]), Source("b", False, 2, 5.0, looks[1]))
+    episodes = [Episode(np.zeros((length, 2))) for length in (7, 2, 2)]
+    held = replace(Demonstrations.of(episodes, "a"), sources=np.array([0, 1, 1], np.int32), source_labels=("a", "b"))
+    without_clusters = np.full(3, -1, np.int32)
+    return Sources(each, held), Transferability(np.array(scores), np.ones(3) / 3, without_clusters)
 
 
 def test_shares_of_the_sampling_mass_count_transitions() -> None:
-    looks = source_looks([True, False])
-    sources = [Source("a", True, 1, looks[0]), Source("b", False, 2, looks[1])]
-    collection = Collection(sources, np.array([0, 1, 1], np.int32), np.array([6, 1, 1]), [None, None])
-    assert collection.shares(collection.transitions.astype(float)) == pytest.approx([0.75, 0.25])  # 6 of 8
-    weights = np.array([0.1, 0.3, 0.1])
-    assert collection.shares(weights * collection.transitions) == pytest.approx([0.6, 0.4])  # 0.6 of 0.6 + 0.3 + 0.1
+    sources, _ = small_sources([0.1, 0.2, 0.3])
+    assert sources.shares(np.ones(3)) == pytest.approx([0.75, 0.25])  # 6 of 8
+    assert sources.shares(np.array([0.1, 0.3, 0.1])) == pytest.approx([0.6, 0.4])  # 0.6 of 0.6 + 0.3 + 0.1
+    assert sources.means(np.array([0.1, 0.3, 0.1])) == pytest.approx([0.1, 0.2])
+
+
+def test_a_weighting_ranks_demonstrations_if_it_tells_those_of_a_source_apart() -> None:
+    sources, constant = small_sources([1.0, 0.0, 0.0])
+    assert not ranks_demonstrations(constant, sources)
+    assert ranks_demonstrations(small_sources([1.0, 0.0, 0.1])[1], sources)
+    assert ranks_demonstrations(replace(constant, clusters=np.zeros(3, np.int32)), sources)
 
 
 def test_no_two_sources_look_alike() -> None:
-    for transferable in ([None] * 30, [i % 3 == 0 for i in range(30)], [True, False, None] * 10):
-        assert len({(look.color, look.marker) for look in source_looks(transferable)}) == 30
+    for marks in ([None] * 30, [i % 3 == 0 for i in range(30)], [True, False, None] * 10):
+        assert len({(look.color, look.marker) for look in source_looks(marks)}) == 30
     same, other = source_looks([True, False])
     assert source_looks([False, True]) == [other, same]
 
 
+def test_text_can_be_read() -> None:
+    assert contrast("#000000", "#ffffff") == pytest.approx(21)
+    for color in (*POLICIES, MUTED):
+        assert contrast(color, "#ffffff") >= 4.5
+    for marks in ([None] * 8, [True] * 5, [False] * 5):
+        assert all(contrast(look.text, look.color) >= 4.5 for look in source_looks(marks))
+    assert contrast(MUTED, "#f7f8fa") >= 4.5  # the soft background of the style sheet
+
+
 def test_a_failed_write_leaves_the_old_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = new_run(tmp_path, ["a"], [3])
+    run = new_run(tmp_path, {"a": True}, (3,))
     path = write_report(run)
     before = path.read_bytes()
-    Writer(run, {"a": True}, [3], 1).demonstrations()
+    Writer(run, 1).demonstrations()
 
     def full_disk(*_: Any) -> None:
         raise OSError(28, "No space left on device")
@@ -462,8 +665,16 @@ def test_a_failed_write_leaves_the_old_report(tmp_path: Path, monkeypatch: pytes
     assert path.read_bytes() == before
 
 
+def test_no_line_names_a_file_or_a_key_of_an_artifact() -> None:
+    import oodil.pipeline.report
+
+    code = "".join(path.read_text() for path in Path(oodil.pipeline.report.__file__).parent.glob("*.py"))
+    assert not re.search(r"\.(safetensors|json)\b", code)
+    assert not re.search(r"\b(imitation|naive_gail|oracle|marks|imitators)\b[\"']", code)
+
+
 def test_stage_times_are_those_of_the_last_computation(tmp_path: Path) -> None:
-    run = new_run(tmp_path, ["a"], [3])
+    run = new_run(tmp_path, {"a": True}, (3,))
     lines = [
         {"event": "stage_interrupted", "stage": "clustering", "seconds": 20.0},
         {"event": "stage_started", "stage": "clustering", "jobs": 1},
@@ -480,4 +691,4 @@ def test_stage_times_are_those_of_the_last_computation(tmp_path: Path) -> None:
         {"event": "stage_failed", "stage": "clustering", "seconds": 7.0},
     ]
     run.directory.events.write_text("\n".join(map(json.dumps, lines)))
-    assert Results(run).seconds() == {"clustering": 50.0, "transferability": 300.5, "imitation": 70.0}
+    assert RunResults(run).seconds() == {"clustering": 50.0, "transferability": 300.5, "imitation": 70.0}
