@@ -18,7 +18,7 @@ from oodil.pipeline.algorithms.learner import Learner
 from oodil.pipeline.artifacts import Checkpoints
 from oodil.pipeline.collecting import nothing_follows
 from oodil.pipeline.config import EnvironmentConfig, TrainingConfig
-from oodil.pipeline.data import Rollout, Snapshot, Unit, UnitResult
+from oodil.pipeline.data import Snapshot, TransitionBatch, Unit, UnitResult
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.seeding import derive_key, torch_seed
 from oodil.pipeline.stage import JobContext, JobStoppedError
@@ -137,9 +137,9 @@ def train(
         if config.lag == 1:
             position.policy, position.policy_version = learner.behavior_policy(), iteration
         results = context.rollouts.gather(follow if config.lag == 1 and not is_last else nothing_follows)
-        rollouts = [result.rollout for result in results]
+        batch = TransitionBatch.of([result.rollout for result in results])
         position.snapshots = [result.snapshot for result in results]
-        metrics = learner.update(rollouts, iteration)
+        metrics = learner.update(batch, iteration)
         if config.lag == 0:
             position.policy, position.policy_version = learner.behavior_policy(), position.iteration
             if not is_last:
@@ -150,8 +150,8 @@ def train(
         for probe in probes:
             if probe.is_due(iteration, config.num_iterations):
                 position.history.append(probe.name, env_steps, probe.measure())
-        returns.extend(rollouts, "episode_returns")
-        lengths.extend(rollouts, "episode_lengths")
+        returns.extend(batch.episode_returns)
+        lengths.extend(batch.episode_lengths)
         context.progress(
             env_steps,
             config.num_iterations * config.steps_per_iteration,
@@ -175,18 +175,18 @@ def experience(
     num_steps: int,
     root_seed: int,
     context: JobContext,
-) -> list[Rollout]:
+) -> TransitionBatch:
     """Collect at least ``num_steps`` steps of every simulator under one policy, beginning with fresh episodes."""
     position = _Position(0, 0, policy, [None] * config.num_groups, History())
     seed = torch_seed(derive_key(root_seed, "experience"))
-    rollouts: list[Rollout] = []
+    rollouts = []
     while position.iteration * config.steps_per_rollout < num_steps:
         context.rollouts.submit([position.unit(g, seed, environment, config) for g in range(config.num_groups)])
         results = context.rollouts.gather()
         rollouts += [result.rollout for result in results]
         position.snapshots = [result.snapshot for result in results]
         position.iteration += 1
-    return rollouts
+    return TransitionBatch.of(rollouts)
 
 
 class _Recent:
@@ -195,9 +195,8 @@ class _Recent:
     def __init__(self) -> None:
         self._values: list[float] = []
 
-    def extend(self, rollouts: list[Rollout], field: str) -> None:
-        for rollout in rollouts:
-            self._values.extend(getattr(rollout, field).tolist())
+    def extend(self, values: NDArray) -> None:
+        self._values.extend(values.tolist())
         del self._values[:-100]
 
     def mean(self, name: str) -> dict[str, float]:

@@ -20,7 +20,7 @@ from oodil.pipeline.algorithms.ppo import Ppo
 from oodil.pipeline.algorithms.trpo import Trpo
 from oodil.pipeline.algorithms.value import ValueFunction
 from oodil.pipeline.config import TrainingConfig
-from oodil.pipeline.data import Rollout
+from oodil.pipeline.data import TransitionBatch
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.seeding import derive_key, torch_seed
 
@@ -34,11 +34,11 @@ class RewardModel(Protocol):
     def state_moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return mean and standard deviation (S,) of the states ahead, or None to learn them from rollouts."""
 
-    def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:
+    def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
         """Return (T, G) rewards."""
 
-    def update(self, rollouts: list[Rollout], iteration: int, step_scale: float) -> dict[str, float]:
-        """Learn from the iteration's rollouts and return metrics; ``step_scale`` multiplies the step size."""
+    def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
+        """Learn from the iteration's batch and return metrics; ``step_scale`` multiplies the step size."""
 
     def state(self) -> dict[str, Tensor]:
         """Return everything needed to continue."""
@@ -54,11 +54,11 @@ class EnvReward:
         """Nothing is known beforehand."""
         return None
 
-    def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:
+    def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
         """Return the (T, G) rewards of the environment."""
-        return side_by_side([r.env_rewards for r in rollouts]).astype(np.float32)
+        return batch.env_rewards.astype(np.float32)
 
-    def update(self, rollouts: list[Rollout], iteration: int, step_scale: float) -> dict[str, float]:
+    def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
         """There is nothing to learn."""
         return {}
 
@@ -68,11 +68,6 @@ class EnvReward:
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """There is nothing to load."""
-
-
-def side_by_side(parts: list[NDArray]) -> NDArray:
-    """Join the groups' (T, g, ...) arrays to (T, G, ...), in group order."""
-    return np.concatenate(parts, axis=1)
 
 
 class Learner:
@@ -105,51 +100,45 @@ class Learner:
         """Return a copy of the present policy, ready to be sent."""
         return self.policy.export()
 
-    def update(self, rollouts: list[Rollout], iteration: int) -> dict[str, float]:
-        """Learn from one iteration's rollouts, given in group order, and return metrics."""
+    def update(self, batch: TransitionBatch, iteration: int) -> dict[str, float]:
+        """Learn from one iteration's batch and return metrics."""
         config = self.config
         step_scale = 1 - iteration / config.num_iterations if config.anneal else 1.0
         rng = torch.Generator().manual_seed(torch_seed(derive_key(self.root_seed, "learner", iteration)))
-        observations = torch.from_numpy(side_by_side([r.observations for r in rollouts]))
-        actions = torch.from_numpy(side_by_side([r.actions for r in rollouts]))
-        log_probs = torch.from_numpy(side_by_side([r.log_probs for r in rollouts]))
-        terminated = side_by_side([r.terminated for r in rollouts])
-        truncated = side_by_side([r.truncated for r in rollouts])
         # Scaled by 1 - discount, values are averages of rewards: of order one, whatever the horizon.
-        rewards = self.reward_model.rewards(rollouts) * np.float32(self._reward_scale)
-        flat = observations.flatten(0, 1)
+        rewards = self.reward_model.rewards(batch) * np.float32(self._reward_scale)
+        observations = torch.from_numpy(batch.observations).flatten(0, 1)
         if self._tracks_moments:
-            self._track(flat)
-        inputs = self.policy.normalize(flat)
-        values, next_values = self._values(inputs, rollouts, terminated | truncated)
+            self._track(observations)
+        inputs = self.policy.normalize(observations)
+        values, next_values = self._values(inputs, batch)
         advantages = generalized_advantages(
-            rewards, values, next_values, terminated, truncated, config.discount, config.gae_lambda
+            rewards, values, next_values, batch.terminated, batch.truncated, config.discount, config.gae_lambda
         )
         metrics = {"reward": float(rewards.mean())}
         metrics |= self.policy_optimizer.update(
-            flat,
-            actions.flatten(0, 1),
-            log_probs.flatten(),
+            observations,
+            torch.from_numpy(batch.actions).flatten(0, 1),
+            torch.from_numpy(batch.log_probs).flatten(),
             torch.from_numpy(standardized(advantages)).flatten(),
             rng,
             step_scale,
         )
         metrics |= self.value.fit(inputs, torch.from_numpy(advantages + values).flatten(), rng)
-        metrics |= self.reward_model.update(rollouts, iteration, step_scale)
+        metrics |= self.reward_model.update(batch, iteration, step_scale)
         return metrics
 
     @torch.no_grad()
-    def _values(
-        self, inputs: Tensor, rollouts: list[Rollout], ended: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _values(self, inputs: Tensor, batch: TransitionBatch) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return (T, G) values of the states, given normalized as ``inputs`` (B, S), and of their successors."""
         # The next state's value is the next row's, but for episode ends and the last row: only those cost a pass.
-        values = self.value(inputs).numpy().reshape(ended.shape)
+        values = self.value(inputs).numpy().reshape(batch.terminated.shape)
         next_values = np.empty_like(values)
         next_values[:-1] = values[1:]
-        apart = ended.copy()
+        apart = batch.ended
         apart[-1] = True
-        next_observations = side_by_side([r.next_observations for r in rollouts])[apart]
-        next_values[apart] = self.value(self.policy.normalize(torch.from_numpy(next_observations))).numpy()
+        successors = self.policy.normalize(torch.from_numpy(batch.next_observations[apart]))
+        next_values[apart] = self.value(successors).numpy()
         return values, next_values
 
     @torch.no_grad()

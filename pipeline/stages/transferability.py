@@ -65,9 +65,9 @@ class ClusterJob:
         environment, section = self.config.environment, self.config.transferability
         horizon = make_batch(environment.id, environment.dynamics, 1).max_episode_steps
         policy = self.learner.behavior_policy()
-        rollouts = experience(policy, environment, section.gail, horizon, self.seed, context)
-        self.reward.settle(rollouts, section.final_steps, section.gail.steps_per_iteration)
-        return sum(rollout.terminated.size for rollout in rollouts)
+        batch = experience(policy, environment, section.gail, horizon, self.seed, context)
+        self.reward.settle(batch, section.final_steps, section.gail.steps_per_iteration)
+        return len(batch)
 
 
 def told_apart(config: RunConfig, scores: NDArray[np.float64], demonstrations: Demonstrations) -> dict[str, float]:

@@ -13,7 +13,7 @@ from oodil.pipeline.algorithms.learner import EnvReward, Learner
 from oodil.pipeline.artifacts import encode_arrays
 from oodil.pipeline.collecting import collect
 from oodil.pipeline.config import DiscriminatorConfig, GailConfig, PpoConfig, TrainingConfig, TrpoConfig, ValueConfig
-from oodil.pipeline.data import Unit
+from oodil.pipeline.data import TransitionBatch, Unit
 from oodil.pipeline.seeding import derive_key
 
 TRPO, PPO = TrpoConfig(), PpoConfig(minibatch_size=40, epochs=2, learning_rate=1e-3)
@@ -58,7 +58,7 @@ def train(learner, first, last, snapshots=(None, None), dynamics=()):
             for group in range(learner.config.num_groups)
         ]
         snapshots = [result.snapshot for result in results]
-        learner.update([result.rollout for result in results], iteration)
+        learner.update(TransitionBatch.of([result.rollout for result in results]), iteration)
     return snapshots
 
 
@@ -139,8 +139,8 @@ def test_the_order_of_the_groups_is_part_of_the_update(shown, rollout):
     rollouts = [rollout(seed, observation_dim=12) for seed in (0, 1)]
     rollouts = [replace(r, actions=np.concatenate((r.actions, r.actions[..., :1]), axis=2)) for r in rollouts]
     one, two = build(shown), build(shown)
-    one.update(rollouts, 0)
-    two.update(rollouts[::-1], 0)
+    one.update(TransitionBatch.of(rollouts), 0)
+    two.update(TransitionBatch.of(rollouts[::-1]), 0)
     assert any(one.state()[name].numpy().tobytes() != two.state()[name].numpy().tobytes() for name in one.state())
 
 
@@ -148,10 +148,11 @@ def test_the_discriminator_steps_after_the_reward_is_read(shown, rollout):
     """The policy learns from the discriminator as it was when the rollouts were collected."""
     made = rollout(0, observation_dim=12)
     made = replace(made, actions=np.concatenate((made.actions, made.actions[..., :1]), axis=2))
+    batch = TransitionBatch.of([made])
     learner = build(shown)
-    expected = float(learner.reward_model.rewards([made]).mean())
-    assert learner.update([made], 0)["reward"] == pytest.approx(expected, rel=1e-6)
-    assert float(learner.reward_model.rewards([made]).mean()) != pytest.approx(expected, rel=1e-6)
+    expected = float(learner.reward_model.rewards(batch).mean())
+    assert learner.update(batch, 0)["reward"] == pytest.approx(expected, rel=1e-6)
+    assert float(learner.reward_model.rewards(batch).mean()) != pytest.approx(expected, rel=1e-6)
 
 
 def test_values_of_next_states(shown, rollout):
@@ -164,11 +165,11 @@ def test_values_of_next_states(shown, rollout):
         successors[:-1][~ended[:-1]] = r.observations[1:][~ended[:-1]]
         rollouts.append(replace(r, next_observations=successors))
     learner = build(shown, normalize_observations=True)
-    flat = torch.from_numpy(np.concatenate([r.observations for r in rollouts], axis=1)).flatten(0, 1)
+    joined = TransitionBatch.of(rollouts)
+    flat = torch.from_numpy(joined.observations).flatten(0, 1)
     learner._track(flat)
-    ended = np.concatenate([r.terminated | r.truncated for r in rollouts], axis=1)
-    values, next_values = learner._values(learner.policy.normalize(flat), rollouts, ended)
-    successors = torch.from_numpy(np.concatenate([r.next_observations for r in rollouts], axis=1))
+    values, next_values = learner._values(learner.policy.normalize(flat), joined)
+    successors = torch.from_numpy(joined.next_observations)
     with torch.no_grad():
         expected = learner.value(learner.policy.normalize(successors.flatten(0, 1))).view(8, 6).numpy()
         present = learner.value(learner.policy.normalize(flat)).view(8, 6).numpy()
@@ -233,5 +234,5 @@ def test_steps_shrink_linearly_over_the_training(shown, rollout, anneal, expecte
     )
     learner = Learner(3, 2, config, Recording(), 0)
     for iteration in range(4):
-        learner.update([rollout(iteration)], iteration)
+        learner.update(TransitionBatch.of([rollout(iteration)]), iteration)
     assert Recording.scales == expected
