@@ -22,12 +22,12 @@ class Adam:
     def learning_rate(self, value: float) -> None:
         self._optimizer.param_groups[0]["lr"] = value
 
-    def step(self, loss: Tensor) -> None:
-        """Differentiate ``loss`` and take one step."""
-        self.apply(torch.autograd.grad(loss, self._parameters))
+    def step(self, loss: Tensor, max_grad_norm: float | None = None) -> None:
+        """Take one step down the gradient of ``loss``, which is scaled down to ``max_grad_norm`` if there is one."""
+        self.apply(torch.autograd.grad(loss, self._parameters), max_grad_norm)
 
     def apply(self, gradients: Sequence[Tensor], max_grad_norm: float | None = None) -> None:
-        """Take one step by gradients that are known, one for each parameter."""
+        """Take one step by known gradients, one for each parameter."""
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
         if max_grad_norm is not None:

@@ -54,13 +54,11 @@ class Ppo:
         kl = 0.0
         for _ in range(config.epochs):
             for chosen in torch.randperm(len(observations), generator=rng).split(config.minibatch_size):
-                layer_inputs = policy.net.layer_inputs(inputs[chosen])
-                mean = policy.net.head(layer_inputs).requires_grad_()
-                new = policy.log_prob(mean, actions[chosen])
+                new = policy.log_prob(policy.net(inputs[chosen]), actions[chosen])
                 old = log_probs[chosen]
                 loss = -clipped_surrogate(new, old, advantages[chosen], config.clip)
                 if config.entropy_bonus:
                     loss = loss - config.entropy_bonus * policy.log_std.sum()
-                self._optimizer.apply(policy.gradients(loss, mean, layer_inputs), config.max_grad_norm)
+                self._optimizer.step(loss, config.max_grad_norm)
                 kl = float((old - new.detach()).mean())
         return {"kl": kl, "entropy": float(policy.log_std.detach().sum()) + 1.4189385 * len(policy.log_std)}

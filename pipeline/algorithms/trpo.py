@@ -12,7 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from oodil.pipeline.algorithms.networks import PolicyNetwork
+from oodil.pipeline.algorithms.networks import Linearization, PolicyNetwork
 from oodil.pipeline.config import TrpoConfig
 
 
@@ -74,19 +74,18 @@ class Trpo:
         config, policy = self.config, self.policy
         max_kl = config.max_kl * step_scale
         inputs = policy.normalize(observations)
-        layer_inputs = policy.net.layer_inputs(inputs)
-        mean = policy.net.head(layer_inputs).requires_grad_()
+        mean = policy.net(inputs)
         surrogate = (torch.exp(policy.log_prob(mean, actions) - log_probs) * advantages).mean()
-        gradient = _flatten(policy.gradients(surrogate, mean, layer_inputs))
+        gradient = _flatten(torch.autograd.grad(surrogate, self._parameters))
         old_mean, old_log_std = mean.detach(), policy.log_std.detach().clone()
-        # Curvature is needed less exactly than the gradient, and its products are the dear part of a step.
-        fewer = [part[:: config.fisher_every].contiguous() for part in layer_inputs]
-        precision = torch.exp(-2 * old_log_std) / len(fewer[0])
+        # Curvature is needed less exactly than the gradient, and its products are the expensive part of a step.
+        linearization = Linearization(policy.net, inputs[:: config.fisher_every].contiguous())
+        precision = torch.exp(-2 * old_log_std) / len(linearization.output)
 
         def fisher_product(vector: Tensor) -> Tensor:
             log_std_tangent, *tangents = self._unflatten(vector)
-            change = policy.net.directional_derivative(fewer, tangents)
-            images = [2 * log_std_tangent, *policy.net.gradients(fewer, change * precision)]
+            change = linearization.output_change(tangents)
+            images = [2 * log_std_tangent, *linearization.gradients(change * precision)]
             return _flatten(images) + config.damping * vector
 
         direction = conjugate_gradient(fisher_product, gradient, config.cg_iterations, config.cg_tolerance)
