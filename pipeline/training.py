@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from oodil.pipeline.algorithms.learner import Learner
-from oodil.pipeline.artifacts import Checkpoints
+from oodil.pipeline.artifacts import Checkpoints, below, nested
 from oodil.pipeline.collecting import nothing_follows
 from oodil.pipeline.config import EnvironmentConfig, TrainingConfig
 from oodil.pipeline.data import Snapshot, TransitionBatch, Unit, UnitResult
@@ -211,14 +211,11 @@ def _refuse_divergence(learner: Learner, metrics: dict[str, float], iteration: i
 
 def _save(learner: Learner, position: _Position, checkpoints: Checkpoints) -> None:
     arrays: Arrays = {"position": np.array([position.iteration, position.policy_version], np.int64)}
-    arrays |= {f"learner/{name}": value.numpy() for name, value in learner.state().items()}
-    arrays |= {f"policy/{name}": value for name, value in position.policy.arrays().items()}
-    arrays |= {f"history/{name}": value for name, value in position.history.arrays().items()}
+    arrays |= nested("learner", {name: value.numpy() for name, value in learner.state_dict().items()})
+    arrays |= nested("policy", position.policy.arrays()) | nested("history", position.history.arrays())
     for group, snapshot in enumerate(position.snapshots):
         assert snapshot is not None
-        arrays[f"snapshot/{group}/states"] = snapshot.states
-        arrays[f"snapshot/{group}/elapsed_steps"] = snapshot.elapsed_steps
-        arrays[f"snapshot/{group}/episode_returns"] = snapshot.episode_returns
+        arrays |= nested(f"snapshot/{group}", vars(snapshot))
     checkpoints.save(position.iteration, arrays)
 
 
@@ -229,12 +226,8 @@ def _resume(learner: Learner, config: TrainingConfig, context: JobContext, check
     if arrays is None:
         fresh: list[Snapshot | None] = [None] * config.num_groups
         return _Position(0, 0, learner.behavior_policy(), fresh, History())
-
-    def below(prefix: str) -> Arrays:
-        return {name[len(prefix) :]: value for name, value in arrays.items() if name.startswith(prefix)}
-
-    learner.load_state({name: torch.from_numpy(value.copy()) for name, value in below("learner/").items()})
+    learner.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in below("learner", arrays).items()})
     iteration, version = (int(value) for value in arrays["position"])
-    snapshots: list[Snapshot | None] = [Snapshot(**below(f"snapshot/{g}/")) for g in range(config.num_groups)]
-    policy = GaussianPolicy.from_arrays(below("policy/"))
-    return _Position(iteration, version, policy, snapshots, History.from_arrays(below("history/")))
+    snapshots: list[Snapshot | None] = [Snapshot(**below(f"snapshot/{g}", arrays)) for g in range(config.num_groups)]
+    policy = GaussianPolicy.from_arrays(below("policy", arrays))
+    return _Position(iteration, version, policy, snapshots, History.from_arrays(below("history", arrays)))

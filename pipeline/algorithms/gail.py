@@ -16,8 +16,11 @@ from oodil.pipeline.algorithms.discriminator import (
     imitation_reward,
     mean_logit_per_demonstration,
 )
-from oodil.pipeline.config import DiscriminatorConfig
+from oodil.pipeline.algorithms.learner import Learner
+from oodil.pipeline.artifacts import below, nested
+from oodil.pipeline.config import DiscriminatorConfig, GailConfig
 from oodil.pipeline.data import Demonstrations, TransitionBatch
+from oodil.pipeline.errors import DataError
 from oodil.pipeline.seeding import derive_key, numpy_rng, torch_seed
 
 
@@ -99,16 +102,15 @@ class AdversarialReward:
         """Return (N,) mean logits of demonstrations by the discriminator as it stands."""
         return mean_logit_per_demonstration(self.discriminator, demonstrations)
 
-    def state(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return the discriminator and its optimizer."""
-        state = {f"net/{name}": value for name, value in self.discriminator.state_dict().items()}
-        return state | {f"optimizer/{name}": value for name, value in self.discriminator.optimizer.state().items()}
+        discriminator = self.discriminator
+        return nested("net", discriminator.state_dict()) | nested("optimizer", discriminator.optimizer.state_dict())
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from `state`."""
-        self.discriminator.load_state_dict({k[4:]: v for k, v in state.items() if k.startswith("net/")})
-        moments = {k[10:]: v for k, v in state.items() if k.startswith("optimizer/")}
-        self.discriminator.optimizer.load_state(moments)
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state_dict`."""
+        self.discriminator.load_state_dict(below("net", state))
+        self.discriminator.optimizer.load_state_dict(below("optimizer", state))
 
     def _policy_pairs(self, batch: TransitionBatch) -> Tensor:
         """Return B pairs: each state with its successor, step by step. They are kept, as an iteration asks twice."""
@@ -117,3 +119,25 @@ class AdversarialReward:
             pairs = self.discriminator.pairs(batch.observations.reshape(shape), batch.next_observations.reshape(shape))
             self._paired = batch, pairs
         return self._paired[1]
+
+
+def imitator(
+    observation_dim: int,
+    action_dim: int,
+    demonstrations: Demonstrations,
+    weights: NDArray[np.float64],
+    config: GailConfig,
+    seed: int,
+) -> Learner[AdversarialReward]:
+    """Return an untrained learner whose reward is a discriminator's, for demonstrations with (N,) weights.
+
+    Raises ValueError unless the weights are finite, not negative and not all zero, and DataError when the
+    demonstrations' states do not have the imitator's dimensions.
+    """
+    if demonstrations.observation_dim != observation_dim:
+        raise DataError(
+            f"demonstrations have states with {demonstrations.observation_dim} dimensions; the imitator's have "
+            f"{observation_dim}"
+        )
+    reward = AdversarialReward(demonstrations, weights, config.discriminator, seed)
+    return Learner(observation_dim, action_dim, config, reward, seed)

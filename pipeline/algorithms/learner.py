@@ -6,7 +6,7 @@ step. Experts learn from the environment's reward, imitators from a discriminato
 Letters: T steps, G simulators (all groups side by side), B = T * G, S observation, A action.
 """
 
-from typing import Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -15,10 +15,9 @@ from torch import Tensor
 
 from oodil.pipeline.algorithms.advantages import generalized_advantages, standardized
 from oodil.pipeline.algorithms.networks import PolicyNetwork
-from oodil.pipeline.algorithms.optimizer import Adam
-from oodil.pipeline.algorithms.ppo import Ppo
-from oodil.pipeline.algorithms.trpo import Trpo
+from oodil.pipeline.algorithms.policy_optimizer import policy_optimizer
 from oodil.pipeline.algorithms.value import ValueFunction
+from oodil.pipeline.artifacts import below, nested
 from oodil.pipeline.config import TrainingConfig
 from oodil.pipeline.data import TransitionBatch
 from oodil.pipeline.policy import GaussianPolicy
@@ -40,11 +39,11 @@ class RewardModel(Protocol):
     def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
         """Learn from the iteration's batch and return metrics; ``step_scale`` multiplies the step size."""
 
-    def state(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return everything needed to continue."""
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from `state`."""
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state_dict`."""
 
 
 class EnvReward:
@@ -62,19 +61,22 @@ class EnvReward:
         """There is nothing to learn."""
         return {}
 
-    def state(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """There is nothing to keep."""
         return {}
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """There is nothing to load."""
 
 
-class Learner:
+Reward = TypeVar("Reward", bound=RewardModel)
+
+
+class Learner(Generic[Reward]):
     """Policy, value function and reward model, and how one iteration changes them."""
 
     def __init__(
-        self, observation_dim: int, action_dim: int, config: TrainingConfig, reward_model: RewardModel, root_seed: int
+        self, observation_dim: int, action_dim: int, config: TrainingConfig, reward_model: Reward, root_seed: int
     ) -> None:
         self.config = config
         self.reward_model = reward_model
@@ -85,11 +87,7 @@ class Learner:
         with torch.no_grad():
             self.policy.log_std.fill_(config.initial_log_std)
         self.value = ValueFunction(observation_dim, config.value, rng)
-        self.policy_optimizer = (
-            Trpo(self.policy, config.policy_optimizer)
-            if config.policy_optimizer.kind == "trpo"
-            else Ppo(self.policy, config.policy_optimizer)
-        )
+        self.policy_optimizer = policy_optimizer(self.policy, config.policy_optimizer)
         moments = reward_model.state_moments()
         self._tracks_moments = config.normalize_observations and moments is None
         if config.normalize_observations and moments is not None:
@@ -154,29 +152,24 @@ class Learner:
         self.policy.input_mean.copy_(mean)
         self.policy.input_scale.copy_(1 / deviation.clamp_min(SMALLEST_DEVIATION))
 
-    def state(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return everything that later iterations depend on, as named tensors."""
         state = {"moments": self._moments}
         for name, part in self._parts().items():
-            state |= {f"{name}/{key}": value for key, value in part.state().items()}
-        for name, module in (("policy", self.policy), ("value", self.value)):
-            state |= {f"{name}/{key}": value for key, value in module.state_dict().items()}
+            state |= nested(name, part.state_dict())
         return state
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from `state`."""
-
-        def below(prefix: str) -> dict[str, Tensor]:
-            return {key[len(prefix) + 1 :]: value for key, value in state.items() if key.startswith(prefix + "/")}
-
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state_dict`."""
         self._moments.copy_(state["moments"])
-        self.policy.load_state_dict(below("policy"))
-        self.value.load_state_dict(below("value"))
         for name, part in self._parts().items():
-            part.load_state(below(name))
+            part.load_state_dict(below(name, state))
 
-    def _parts(self) -> dict[str, RewardModel | Trpo | Ppo | Adam]:
+    def _parts(self) -> dict[str, Any]:
+        """Return everything with a ``state_dict``, by its name in the learner's own."""
         return {
+            "policy": self.policy,
+            "value": self.value,
             "policy_optimizer": self.policy_optimizer,
             "value_optimizer": self.value.optimizer,
             "reward_model": self.reward_model,

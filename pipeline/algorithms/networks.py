@@ -136,6 +136,10 @@ class PolicyNetwork(nn.Module):
         constant = 0.5 * float(np.log(2 * np.pi)) * actions.shape[-1]
         return -0.5 * standardized.square().sum(-1) - self.log_std.sum() - constant
 
+    def entropy(self) -> Tensor:
+        """Return the entropy of the Gaussian in nats, which does not depend on the observation."""
+        return self.log_std.sum() + 0.5 * (1 + float(np.log(2 * np.pi))) * len(self.log_std)
+
     def export(self) -> GaussianPolicy:
         """Return a copy for rollout workers."""
         layers = self.net.layers
@@ -147,13 +151,3 @@ class PolicyNetwork(nn.Module):
             input_mean=self.input_mean.numpy().copy(),
             input_scale=self.input_scale.numpy().copy(),
         )
-
-    @torch.no_grad()
-    def load(self, policy: GaussianPolicy) -> None:
-        """Take over the parameters of an exported policy; shapes must agree."""
-        for layer, weight, bias in zip(self.net.layers, policy.weights, policy.biases, strict=True):
-            layer.weight.copy_(torch.tensor(weight.T))
-            layer.bias.copy_(torch.tensor(bias))
-        self.log_std.copy_(torch.tensor(policy.log_std))
-        self.input_mean.copy_(torch.tensor(policy.input_mean))
-        self.input_scale.copy_(torch.tensor(policy.input_scale))

@@ -34,13 +34,13 @@ class Adam:
             torch.nn.utils.clip_grad_norm_(self._parameters, max_grad_norm)
         self._optimizer.step()
 
-    def state(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return the moments and the step count of every parameter; empty before the first step."""
         moments = self._optimizer.state_dict()["state"]
         return {f"{i}.{name}": value for i, entry in moments.items() for name, value in entry.items()}
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from `state`."""
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state_dict`."""
         whole = self._optimizer.state_dict()
         whole["state"] = {}
         for name, value in state.items():

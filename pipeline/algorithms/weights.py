@@ -11,7 +11,7 @@ from oodil.pipeline.data import Demonstrations
 Array = NDArray[np.float64]
 
 
-def transferability(mean_logits: Array) -> Array:
+def transferability_of_logits(mean_logits: Array) -> Array:
     """Return sigmoid(-mean logit): 0.5 where the imitator cannot be told from the demonstration, 0 where it fails.
 
     ``mean_logits`` is (N,) or (E, N), of logits that are high for demonstrations; the paper's D is one minus ours.

@@ -14,7 +14,7 @@ from oodil.pipeline.algorithms.weights import (
     sampling_mass,
     share_lasted,
     sharpened_weights,
-    transferability,
+    transferability_of_logits,
 )
 from oodil.pipeline.artifacts import Files, encode_arrays, encode_json
 from oodil.pipeline.config import RunConfig
@@ -155,10 +155,10 @@ class TransferabilityStage(Stage):
             closest = min(trained, key=lambda arrays: float(arrays["logits"][-1].mean()))
             logits[closest["demonstrations"]] = closest["logits"][-1]
             history[f"cluster_{cluster}/env_steps"] = closest["env_steps"]
-            history[f"cluster_{cluster}/scores"] = transferability(closest["logits"])
+            history[f"cluster_{cluster}/scores"] = transferability_of_logits(closest["logits"])
             history[f"cluster_{cluster}/demonstrations"] = closest["demonstrations"]
         horizon = make_batch(config.environment.id, config.environment.dynamics, 1).max_episode_steps
-        scores = transferability(logits) * share_lasted(demonstrations, horizon)
+        scores = transferability_of_logits(logits) * share_lasted(demonstrations, horizon)
         sharpening = config.transferability.sharpening
         weights = sharpened_weights(scores, sharpening)
         arrays = {"scores": scores, "weights": weights, "clusters": _labels(run)}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from oodil.pipeline.algorithms.weights import transferability
+from oodil.pipeline.algorithms.weights import transferability_of_logits
 from oodil.pipeline.environments.locomotion import HopperEnv
 from oodil.pipeline.loading import load_config
 from tests.runs import MICRO, artifacts, run
@@ -101,7 +101,7 @@ def test_a_second_training_leaves_the_first_alone_and_the_closest_counts(inline:
     assert firsts
     for first in firsts:
         trained = [load_file(path / "scores.safetensors") for path in (first, jobs / f"{first.name}-training-2")]
-        last = [transferability(training["logits"][-1]) for training in trained]
+        last = [transferability_of_logits(training["logits"][-1]) for training in trained]
         assert not np.array_equal(*last), "both had the same luck"
         assert np.array_equal(scores[trained[0]["demonstrations"]], max(last, key=np.mean))
     run("run", str(MICRO), NAIVE, "--run-dir", str(inline), "--workers", "0")

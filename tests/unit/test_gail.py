@@ -8,9 +8,11 @@ import torch
 from scipy.stats import chisquare
 
 from oodil.pipeline.algorithms.discriminator import imitation_reward
-from oodil.pipeline.algorithms.gail import AdversarialReward
-from oodil.pipeline.config import DiscriminatorConfig
+from oodil.pipeline.algorithms.gail import AdversarialReward, imitator
+from oodil.pipeline.algorithms.learner import Learner
+from oodil.pipeline.config import DiscriminatorConfig, GailConfig
 from oodil.pipeline.data import TransitionBatch
+from oodil.pipeline.errors import DataError
 
 
 def build(demonstrations, weights, **settings):
@@ -143,7 +145,7 @@ def test_an_update_depends_on_the_iteration_and_not_on_what_was_drawn_before(dem
     for iteration in range(2):
         one.update(batch_of(rollout(iteration)), iteration, 1.0)
         two.update(batch_of(rollout(iteration)), iteration, 1.0)
-    assert_same_bits(one.state(), two.state())
+    assert_same_bits(one.state_dict(), two.state_dict())
 
 
 def test_an_artificial_reward_of_the_environment_changes_nothing(demonstrations, rollout, assert_same_bits):
@@ -153,27 +155,27 @@ def test_an_artificial_reward_of_the_environment_changes_nothing(demonstrations,
     assert_same_bits(one.rewards(plain), two.rewards(poisoned))
     one.update(plain, 0, 1.0)
     two.update(poisoned, 0, 1.0)
-    assert_same_bits(one.state(), two.state())
+    assert_same_bits(one.state_dict(), two.state_dict())
 
 
 def test_state_restores_another_instance(demonstrations, rollout, assert_same_bits):
     one = build(demonstrations(20), [1.0])
     one.update(batch_of(rollout(0)), 0, 1.0)
     two = AdversarialReward(demonstrations(20), np.ones(1), DiscriminatorConfig(), root_seed=0)
-    two.load_state({name: value.clone() for name, value in one.state().items()})
+    two.load_state_dict({name: value.clone() for name, value in one.state_dict().items()})
     for iteration in (1, 2):
         one.update(batch_of(rollout(iteration)), iteration, 1.0)
         two.update(batch_of(rollout(iteration)), iteration, 1.0)
-    assert_same_bits(one.state(), two.state())
+    assert_same_bits(one.state_dict(), two.state_dict())
 
 
 def test_loading_a_state_does_not_tie_two_instances_together(demonstrations, rollout, assert_same_bits):
     one, two = (build(demonstrations(20), [1.0]) for _ in range(2))
     one.update(batch_of(rollout(0)), 0, 1.0)
-    two.load_state(one.state())
-    kept = {name: value.clone() for name, value in one.state().items()}
+    two.load_state_dict(one.state_dict())
+    kept = {name: value.clone() for name, value in one.state_dict().items()}
     two.update(batch_of(rollout(1)), 1, 1.0)
-    assert_same_bits(one.state(), kept)
+    assert_same_bits(one.state_dict(), kept)
 
 
 def test_step_scale_multiplies_the_step_size(demonstrations, rollout):
@@ -198,4 +200,19 @@ def test_a_settled_discriminator_tells_a_policy_that_no_longer_learns(demonstrat
     one.settle(batch, steps=100, batch_size=64)
     two.settle(batch, steps=100, batch_size=64)
     assert (one.mean_logits(shown) > before + 2).all()
-    assert_same_bits(one.state(), two.state())
+    assert_same_bits(one.state_dict(), two.state_dict())
+
+
+def test_an_imitator_is_a_learner_with_an_adversarial_reward(demonstrations, rollout, assert_same_bits):
+    shown, weights, config = demonstrations(20, 20), np.array([1.0, 0.5]), GailConfig(total_steps=100)
+    one = imitator(3, 2, shown, weights, config, seed=7)
+    two = Learner(3, 2, config, AdversarialReward(shown, weights, config.discriminator, 7), 7)
+    for learner in (one, two):
+        learner.update(batch_of(rollout(0)), 0)
+    assert_same_bits(one.state_dict(), two.state_dict())
+    assert one.reward_model.mean_logits(shown).shape == (2,)
+
+
+def test_an_imitator_needs_demonstrations_of_its_own_states(demonstrations):
+    with pytest.raises(DataError, match="states with 3 dimensions; the imitator's have 12"):
+        imitator(12, 3, demonstrations(5), np.ones(1), GailConfig(total_steps=100), seed=0)

@@ -86,34 +86,34 @@ def test_interrupted_equals_uninterrupted(shown, assert_same_bits, policy_optimi
     }
     whole = build(**settings)
     snapshots = train(whole, 0, 2)
-    saved = through_a_file(whole.state())
+    saved = through_a_file(whole.state_dict())
     train(whole, 2, 4, snapshots)
 
     resumed = build(**settings)
     train(resumed, 0, 1)  # whatever it was before must not matter
-    resumed.load_state(saved)
+    resumed.load_state_dict(saved)
     train(resumed, 2, 4, snapshots)
-    assert_same_bits(resumed.state(), whole.state())
+    assert_same_bits(resumed.state_dict(), whole.state_dict())
     assert_same_bits(resumed.behavior_policy(), whole.behavior_policy())
-    assert any(not torch.equal(value, saved[name]) for name, value in whole.state().items())
+    assert any(not torch.equal(value, saved[name]) for name, value in whole.state_dict().items())
 
 
 @pytest.mark.parametrize("policy_optimizer", [TRPO, PPO], ids=["trpo", "ppo"])
 def test_a_fresh_state_can_be_saved_and_loaded(shown, assert_same_bits, policy_optimizer):
     one, two = (build(shown, policy_optimizer=policy_optimizer) for _ in range(2))
-    two.load_state(through_a_file(one.state()))
+    two.load_state_dict(through_a_file(one.state_dict()))
     train(one, 0, 1)
     train(two, 0, 1)
-    assert_same_bits(one.state(), two.state())
+    assert_same_bits(one.state_dict(), two.state_dict())
 
 
 def test_every_tensor_of_the_state_is_needed_and_restored(shown, assert_same_bits):
     """No entry is forgotten: a state of other numbers comes back as it is."""
     learner = build(shown, policy_optimizer=PPO, normalize_observations=True)
     train(learner, 0, 2)
-    other = {name: torch.full_like(value, 0.5) for name, value in learner.state().items()}
-    learner.load_state(through_a_file(other))
-    assert_same_bits(dict(learner.state()), other)
+    other = {name: torch.full_like(value, 0.5) for name, value in learner.state_dict().items()}
+    learner.load_state_dict(through_a_file(other))
+    assert_same_bits(dict(learner.state_dict()), other)
     parts = {name.split("/")[0] for name in other}
     assert parts == {"moments", "policy_optimizer", "value_optimizer", "reward_model", "policy", "value"}
 
@@ -124,15 +124,15 @@ def test_imitation_without_a_true_reward_gives_the_same_bits(shown, assert_same_
     plain, poisoned = (build(shown, policy_optimizer=policy_optimizer) for _ in range(2))
     train(plain, 0, 3)
     train(poisoned, 0, 3, dynamics=(("forward_reward_weight", math.nan),))
-    assert_same_bits(poisoned.state(), plain.state())
-    assert all(torch.isfinite(value).all() for value in poisoned.state().values())
+    assert_same_bits(poisoned.state_dict(), plain.state_dict())
+    assert all(torch.isfinite(value).all() for value in poisoned.state_dict().values())
 
 
 def test_an_expert_does_learn_from_the_true_reward(assert_same_bits):
     plain, poisoned = build(), build()
     train(plain, 0, 1)
     train(poisoned, 0, 1, dynamics=(("healthy_reward", 5.0),))
-    assert any(not torch.equal(plain.state()[name], poisoned.state()[name]) for name in plain.state())
+    assert any(not torch.equal(plain.state_dict()[name], poisoned.state_dict()[name]) for name in plain.state_dict())
 
 
 def test_the_order_of_the_groups_is_part_of_the_update(shown, rollout):
@@ -141,7 +141,8 @@ def test_the_order_of_the_groups_is_part_of_the_update(shown, rollout):
     one, two = build(shown), build(shown)
     one.update(TransitionBatch.of(rollouts), 0)
     two.update(TransitionBatch.of(rollouts[::-1]), 0)
-    assert any(one.state()[name].numpy().tobytes() != two.state()[name].numpy().tobytes() for name in one.state())
+    states = one.state_dict(), two.state_dict()
+    assert any(states[0][name].numpy().tobytes() != states[1][name].numpy().tobytes() for name in states[0])
 
 
 def test_the_discriminator_steps_after_the_reward_is_read(shown, rollout):

@@ -11,7 +11,7 @@ from oodil.pipeline.algorithms.weights import (
     sampling_mass,
     share_lasted,
     sharpened_weights,
-    transferability,
+    transferability_of_logits,
 )
 from oodil.pipeline.config import DiscriminatorConfig
 
@@ -30,7 +30,7 @@ def test_mean_logit_is_over_the_transitions_of_each_demonstration(demonstrations
 
 
 def test_transferability_is_half_where_nothing_can_be_told_and_falls_with_the_logit():
-    np.testing.assert_allclose(transferability(np.array([0.0, np.log(3.0), -np.log(3.0)])), [0.5, 0.25, 0.75])
+    np.testing.assert_allclose(transferability_of_logits(np.array([0.0, np.log(3.0), -np.log(3.0)])), [0.5, 0.25, 0.75])
 
 
 def test_a_failure_counts_for_the_part_of_the_horizon_that_it_lasted(demonstrations):
