@@ -33,7 +33,7 @@ from oodil.bench import random_demonstrations
 from oodil.pipeline.algorithms.gail import AdversarialReward
 from oodil.pipeline.algorithms.learner import Learner
 from oodil.pipeline.collecting import collect
-from oodil.pipeline.data import Unit, UnitResult
+from oodil.pipeline.data import TransitionBatch, Unit, UnitResult
 from oodil.pipeline.environments import make_batch
 from oodil.pipeline.seeding import derive_key
 from oodil.pipeline.versions import collecting_versions, library_versions
@@ -83,7 +83,7 @@ def real_costs(env_id: str) -> tuple[dict[str, float], Unit, UnitResult]:
             results.append(result)
             snapshots[group] = result.snapshot
         started = time.process_time()
-        learner.update([result.rollout for result in results], iteration)
+        learner.update(TransitionBatch.of([result.rollout for result in results]), iteration)
         updating.append((time.process_time() - started) / gail.num_groups)
     costs = {
         "collect_s": statistics.median(collecting[-COLLECTED:]),

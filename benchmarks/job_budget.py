@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from benchmarks.gail_reference import Quiet
 from benchmarks.throughput import machine
 from oodil.orchestrator import read_run
-from oodil.pipeline.algorithms.weights import share_lasted, transferability
+from oodil.pipeline.algorithms.weights import share_lasted, transferability_of_logits
 from oodil.pipeline.artifacts import Checkpoints
 from oodil.pipeline.environments import make_batch
 from oodil.pipeline.evaluation import evaluate
@@ -88,7 +88,7 @@ def main() -> None:
         members = job["demonstrations"]
         logits[:, members] = job["logits"]
         counts = np.bincount(demonstrations.sources[members], minlength=len(demonstrations.source_labels))
-        scores = transferability(job["logits"]).mean(axis=1)
+        scores = transferability_of_logits(job["logits"]).mean(axis=1)
         rows[name] = {
             "sources": dict(zip(demonstrations.source_labels, counts.tolist(), strict=True)),
             "scores": scores.tolist(),
@@ -96,7 +96,7 @@ def main() -> None:
         }
         print(f"{name} {counts.tolist()}: " + " ".join(f"{score:.4f}" for score in scores))
     horizon = make_batch(config.environment.id, config.environment.dynamics, 1).max_episode_steps
-    all_scores = transferability(logits) * share_lasted(demonstrations, horizon)
+    all_scores = transferability_of_logits(logits) * share_lasted(demonstrations, horizon)
     readings = [told_apart(config, scores, demonstrations) for scores in all_scores]
     by_budget = {"env_steps": jobs[0]["env_steps"].tolist()}
     by_budget |= {figure: [reading[figure] for reading in readings] for figure in readings[0]}

@@ -225,7 +225,7 @@ def rollout_rate(env_id: str, workers: int) -> float:
             collected = experience(policy, environment, config, SCALING_STEPS, 1, context)
             seconds = time.perf_counter() - started
         rollouts.close()
-    return sum(rollout.terminated.size for rollout in collected) / seconds
+    return len(collected) / seconds
 
 
 def scaling(env_id: str, rounds: int) -> dict[str, Any]:

@@ -9,9 +9,10 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import safetensors
@@ -23,6 +24,7 @@ from oodil.pipeline.errors import DamagedArtifactError, StorageError
 MANIFEST = "manifest.json"
 KEPT_CHECKPOINTS = 2
 
+Value = TypeVar("Value")
 Files = dict[str, bytes]
 """Contents of an artifact by file name."""
 
@@ -31,6 +33,17 @@ def encode_arrays(arrays: dict[str, NDArray]) -> bytes:
     """Return a safetensors file with the given arrays."""
     # Not ascontiguousarray, which turns a scalar into an array of one.
     return safetensors.numpy.save({name: np.asarray(value, order="C") for name, value in arrays.items()})
+
+
+def nested(prefix: str, values: Mapping[str, Value]) -> dict[str, Value]:
+    """Return arrays or tensors under names that begin with ``prefix/``, to be kept with others; see `below`."""
+    return {f"{prefix}/{name}": value for name, value in values.items()}
+
+
+def below(prefix: str, values: Mapping[str, Value]) -> dict[str, Value]:
+    """Return what `nested` put under a prefix, by its own names."""
+    start = f"{prefix}/"
+    return {name.removeprefix(start): value for name, value in values.items() if name.startswith(start)}
 
 
 def encode_json(value: Any) -> bytes:

@@ -5,7 +5,7 @@ Shapes are checked where a value is made, so that no stage has to ask again.
 Letters: N demonstrations, T states of one or steps of a rollout, G simulators, S observation, A action.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -210,6 +210,69 @@ class Rollout:
     """(E,) true returns of the episodes that ended; evaluation only."""
     episode_lengths: NDArray[np.int64]
     """(E,)"""
+
+
+@dataclass(frozen=True)
+class TransitionBatch:
+    """What one update learns from: the rollouts of all env groups, their G simulators side by side in group order."""
+
+    policy_version: int
+    observations: NDArray[np.float32]
+    """(T, G, S)"""
+    next_observations: NDArray[np.float32]
+    """(T, G, S), before any reset."""
+    actions: NDArray[np.float32]
+    """(T, G, A)"""
+    log_probs: NDArray[np.float32]
+    """(T, G) under the policy that acted."""
+    terminated: NDArray[np.bool_]
+    """(T, G)"""
+    truncated: NDArray[np.bool_]
+    """(T, G)"""
+    env_rewards: NDArray[np.float64]
+    """(T, G); only experts learn from it."""
+    episode_returns: NDArray[np.float64]
+    """(E,) true returns of the episodes that ended; evaluation only."""
+    episode_lengths: NDArray[np.int64]
+    """(E,)"""
+
+    @classmethod
+    def of(cls, rollouts: Sequence[Rollout]) -> "TransitionBatch":
+        """Join rollouts of equal length, given in group order.
+
+        Raises ValueError when there is none, or when they were collected under different policy versions.
+        """
+        versions = {rollout.policy_version for rollout in rollouts}
+        if len(versions) != 1:
+            raise ValueError(f"a batch needs rollouts of one policy version; these have {sorted(versions)}")
+
+        def joined(name: str, axis: int) -> NDArray:
+            return np.concatenate([getattr(rollout, name) for rollout in rollouts], axis=axis)
+
+        per_step = (
+            "observations",
+            "next_observations",
+            "actions",
+            "log_probs",
+            "terminated",
+            "truncated",
+            "env_rewards",
+        )
+        per_episode = ("episode_returns", "episode_lengths")
+        return cls(
+            policy_version=versions.pop(),
+            **{name: joined(name, axis=1) for name in per_step},
+            **{name: joined(name, axis=0) for name in per_episode},
+        )
+
+    def __len__(self) -> int:
+        """Return B = T * G, the number of transitions."""
+        return self.terminated.size
+
+    @property
+    def ended(self) -> NDArray[np.bool_]:
+        """(T, G) whether the transition is its episode's last."""
+        return self.terminated | self.truncated
 
 
 @dataclass(frozen=True)

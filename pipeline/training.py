@@ -15,10 +15,10 @@ import torch
 from numpy.typing import NDArray
 
 from oodil.pipeline.algorithms.learner import Learner
-from oodil.pipeline.artifacts import Checkpoints
+from oodil.pipeline.artifacts import Checkpoints, below, nested
 from oodil.pipeline.collecting import nothing_follows
 from oodil.pipeline.config import EnvironmentConfig, TrainingConfig
-from oodil.pipeline.data import Rollout, Snapshot, Unit, UnitResult
+from oodil.pipeline.data import Snapshot, TransitionBatch, Unit, UnitResult
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.seeding import derive_key, torch_seed
 from oodil.pipeline.stage import JobContext, JobStoppedError
@@ -137,9 +137,9 @@ def train(
         if config.lag == 1:
             position.policy, position.policy_version = learner.behavior_policy(), iteration
         results = context.rollouts.gather(follow if config.lag == 1 and not is_last else nothing_follows)
-        rollouts = [result.rollout for result in results]
+        batch = TransitionBatch.of([result.rollout for result in results])
         position.snapshots = [result.snapshot for result in results]
-        metrics = learner.update(rollouts, iteration)
+        metrics = learner.update(batch, iteration)
         if config.lag == 0:
             position.policy, position.policy_version = learner.behavior_policy(), position.iteration
             if not is_last:
@@ -150,8 +150,8 @@ def train(
         for probe in probes:
             if probe.is_due(iteration, config.num_iterations):
                 position.history.append(probe.name, env_steps, probe.measure())
-        returns.extend(rollouts, "episode_returns")
-        lengths.extend(rollouts, "episode_lengths")
+        returns.extend(batch.episode_returns)
+        lengths.extend(batch.episode_lengths)
         context.progress(
             env_steps,
             config.num_iterations * config.steps_per_iteration,
@@ -175,18 +175,18 @@ def experience(
     num_steps: int,
     root_seed: int,
     context: JobContext,
-) -> list[Rollout]:
+) -> TransitionBatch:
     """Collect at least ``num_steps`` steps of every simulator under one policy, beginning with fresh episodes."""
     position = _Position(0, 0, policy, [None] * config.num_groups, History())
     seed = torch_seed(derive_key(root_seed, "experience"))
-    rollouts: list[Rollout] = []
+    rollouts = []
     while position.iteration * config.steps_per_rollout < num_steps:
         context.rollouts.submit([position.unit(g, seed, environment, config) for g in range(config.num_groups)])
         results = context.rollouts.gather()
         rollouts += [result.rollout for result in results]
         position.snapshots = [result.snapshot for result in results]
         position.iteration += 1
-    return rollouts
+    return TransitionBatch.of(rollouts)
 
 
 class _Recent:
@@ -195,9 +195,8 @@ class _Recent:
     def __init__(self) -> None:
         self._values: list[float] = []
 
-    def extend(self, rollouts: list[Rollout], field: str) -> None:
-        for rollout in rollouts:
-            self._values.extend(getattr(rollout, field).tolist())
+    def extend(self, values: NDArray) -> None:
+        self._values.extend(values.tolist())
         del self._values[:-100]
 
     def mean(self, name: str) -> dict[str, float]:
@@ -212,14 +211,11 @@ def _refuse_divergence(learner: Learner, metrics: dict[str, float], iteration: i
 
 def _save(learner: Learner, position: _Position, checkpoints: Checkpoints) -> None:
     arrays: Arrays = {"position": np.array([position.iteration, position.policy_version], np.int64)}
-    arrays |= {f"learner/{name}": value.numpy() for name, value in learner.state().items()}
-    arrays |= {f"policy/{name}": value for name, value in position.policy.arrays().items()}
-    arrays |= {f"history/{name}": value for name, value in position.history.arrays().items()}
+    arrays |= nested("learner", {name: value.numpy() for name, value in learner.state_dict().items()})
+    arrays |= nested("policy", position.policy.arrays()) | nested("history", position.history.arrays())
     for group, snapshot in enumerate(position.snapshots):
         assert snapshot is not None
-        arrays[f"snapshot/{group}/states"] = snapshot.states
-        arrays[f"snapshot/{group}/elapsed_steps"] = snapshot.elapsed_steps
-        arrays[f"snapshot/{group}/episode_returns"] = snapshot.episode_returns
+        arrays |= nested(f"snapshot/{group}", vars(snapshot))
     checkpoints.save(position.iteration, arrays)
 
 
@@ -230,12 +226,8 @@ def _resume(learner: Learner, config: TrainingConfig, context: JobContext, check
     if arrays is None:
         fresh: list[Snapshot | None] = [None] * config.num_groups
         return _Position(0, 0, learner.behavior_policy(), fresh, History())
-
-    def below(prefix: str) -> Arrays:
-        return {name[len(prefix) :]: value for name, value in arrays.items() if name.startswith(prefix)}
-
-    learner.load_state({name: torch.from_numpy(value.copy()) for name, value in below("learner/").items()})
+    learner.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in below("learner", arrays).items()})
     iteration, version = (int(value) for value in arrays["position"])
-    snapshots: list[Snapshot | None] = [Snapshot(**below(f"snapshot/{g}/")) for g in range(config.num_groups)]
-    policy = GaussianPolicy.from_arrays(below("policy/"))
-    return _Position(iteration, version, policy, snapshots, History.from_arrays(below("history/")))
+    snapshots: list[Snapshot | None] = [Snapshot(**below(f"snapshot/{g}", arrays)) for g in range(config.num_groups)]
+    policy = GaussianPolicy.from_arrays(below("policy", arrays))
+    return _Position(iteration, version, policy, snapshots, History.from_arrays(below("history", arrays)))

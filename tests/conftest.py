@@ -57,14 +57,10 @@ def network() -> Callable[..., PolicyNetwork]:
 def plain_mlp() -> Callable[..., torch.Tensor]:
     """Return an MLP as a function of its parameters and input, all in torch, which differentiates it in every way."""
 
-    def output(
-        parameters: list[torch.Tensor],
-        x: torch.Tensor,
-        tanh: Callable[[torch.Tensor], torch.Tensor] = torch.tanh,
-    ) -> torch.Tensor:
+    def output(parameters: list[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
         *hidden, head = zip(parameters[::2], parameters[1::2], strict=True)
         for weight, bias in hidden:
-            x = tanh(torch.nn.functional.linear(x, weight, bias))
+            x = torch.tanh(torch.nn.functional.linear(x, weight, bias))
         return torch.nn.functional.linear(x, *head)
 
     return output

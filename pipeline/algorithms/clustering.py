@@ -21,6 +21,7 @@ from torch.nn.functional import normalize
 
 from oodil.pipeline.algorithms.contrastive import Encoder, Sampling, Subtrajectories, contrastive_loss, standardization
 from oodil.pipeline.algorithms.optimizer import Adam
+from oodil.pipeline.artifacts import below, nested
 from oodil.pipeline.config import ClusteringConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.errors import DataError
@@ -130,7 +131,7 @@ class ClusterModel:
 
 
 class ContrastiveClustering:
-    """Algorithm 1, one iteration per call; all that it remembers is in `state`."""
+    """Algorithm 1, one iteration per call; all that it remembers is in `state_dict`."""
 
     def __init__(self, demonstrations: Demonstrations, config: ClusteringConfig, root_seed: int) -> None:
         """Prepare the encoder. Raises DataError when there are fewer demonstrations than clusters."""
@@ -185,22 +186,17 @@ class ContrastiveClustering:
         sampling = self._subtrajectories.sampling
         return ClusterModel(self.encoder, self.centers, self.counts, sampling, self._state_mean, self._state_scale)
 
-    def state(self) -> dict[str, NDArray]:
+    def state_dict(self) -> dict[str, NDArray]:
         """Return everything that later iterations depend on."""
-        tensors = {f"encoder/{name}": value for name, value in self.encoder.state_dict().items()}
-        tensors |= {f"optimizer/{name}": value for name, value in self._optimizer.state().items()}
+        tensors = nested("encoder", self.encoder.state_dict()) | nested("optimizer", self._optimizer.state_dict())
         tensors |= {"centers": self.centers, "counts": self.counts, "iteration": torch.tensor([self.iteration])}
         return {name: value.numpy() for name, value in tensors.items()}
 
-    def load_state(self, state: dict[str, NDArray]) -> None:
-        """Continue from `state`."""
+    def load_state_dict(self, state: dict[str, NDArray]) -> None:
+        """Continue from `state_dict`."""
         tensors = {name: torch.from_numpy(value) for name, value in state.items()}
-
-        def below(prefix: str) -> dict[str, Tensor]:
-            return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-
-        self.encoder.load_state_dict(below("encoder/"))
-        self._optimizer.load_state(below("optimizer/"))
+        self.encoder.load_state_dict(below("encoder", tensors))
+        self._optimizer.load_state_dict(below("optimizer", tensors))
         self.centers, self.counts = tensors["centers"], tensors["counts"]
         self.iteration = int(tensors["iteration"])
 

@@ -61,17 +61,14 @@ class Discriminator(nn.Module):
     def update(self, demonstration_pairs: Tensor, policy_pairs: Tensor) -> dict[str, float]:
         """Take one full-batch step on (M, 2S) demonstration pairs against (B, 2S) policy pairs."""
         count = len(demonstration_pairs)
-        layer_inputs = self.net.layer_inputs(torch.cat((demonstration_pairs, policy_pairs)))
-        logits = self.net.head(layer_inputs).squeeze(-1).requires_grad_()
+        logits = self(torch.cat((demonstration_pairs, policy_pairs)))
         loss = discriminator_loss(logits[:count], logits[count:])
-        (gradient,) = torch.autograd.grad(loss, logits)
-        self.optimizer.apply(self.net.gradients(layer_inputs, gradient.unsqueeze(-1)))
-        with torch.no_grad():
-            return {
-                "discriminator_loss": float(loss),
-                "demonstration_accuracy": float((logits[:count] > 0).float().mean()),
-                "policy_accuracy": float((logits[count:] < 0).float().mean()),
-            }
+        self.optimizer.step(loss)
+        return {
+            "discriminator_loss": float(loss.detach()),
+            "demonstration_accuracy": float((logits[:count] > 0).float().mean()),
+            "policy_accuracy": float((logits[count:] < 0).float().mean()),
+        }
 
 
 @torch.no_grad()

@@ -16,9 +16,11 @@ from oodil.pipeline.algorithms.discriminator import (
     imitation_reward,
     mean_logit_per_demonstration,
 )
-from oodil.pipeline.algorithms.learner import side_by_side
-from oodil.pipeline.config import DiscriminatorConfig
-from oodil.pipeline.data import Demonstrations, Rollout
+from oodil.pipeline.algorithms.learner import Learner
+from oodil.pipeline.artifacts import below, nested
+from oodil.pipeline.config import DiscriminatorConfig, GailConfig
+from oodil.pipeline.data import Demonstrations, TransitionBatch
+from oodil.pipeline.errors import DataError
 from oodil.pipeline.seeding import derive_key, numpy_rng, torch_seed
 
 
@@ -47,6 +49,7 @@ class AdversarialReward:
         self._observations = demonstrations.observations
         rng = torch.Generator().manual_seed(torch_seed(derive_key(root_seed, "discriminator", "initial")))
         self.discriminator = Discriminator(demonstrations.observation_dim, config, rng)
+        self._paired: tuple[TransitionBatch, Tensor] | None = None
 
     def state_moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return mean and standard deviation (S,) of the demonstrations' states as they are weighted."""
@@ -56,17 +59,17 @@ class AdversarialReward:
         return np.asarray(mean), np.sqrt(variance)
 
     @torch.no_grad()
-    def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:
+    def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
         """Return (T, G) rewards of the discriminator before its own step of the same iteration."""
-        logits = self.discriminator(self._policy_pairs(rollouts))
+        logits = self.discriminator(self._policy_pairs(batch))
         rewards = imitation_reward(logits, self.discriminator.config.reward).numpy()
-        return rewards.reshape(rollouts[0].terminated.shape[0], -1)
+        return rewards.reshape(batch.terminated.shape)
 
-    def update(self, rollouts: list[Rollout], iteration: int, step_scale: float) -> dict[str, float]:
-        """Step the discriminator on the rollouts against as many demonstration pairs, or all of them if fewer."""
+    def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
+        """Step the discriminator on the batch against as many demonstration pairs, or all of them if fewer."""
         config = self.discriminator.config
         self.discriminator.optimizer.learning_rate = config.learning_rate * step_scale
-        policy_pairs = self._policy_pairs(rollouts)
+        policy_pairs = self._policy_pairs(batch)
         rng = numpy_rng(derive_key(self.root_seed, "discriminator", iteration))
         count = min(len(self._starts), len(policy_pairs))
         metrics: dict[str, float] = {}
@@ -74,15 +77,15 @@ class AdversarialReward:
             metrics = self.discriminator.update(self.draw(count, rng), policy_pairs)
         return metrics
 
-    def settle(self, rollouts: list[Rollout], steps: int, batch_size: int) -> None:
-        """Go on with the discriminator alone, against rollouts of a policy that no longer learns.
+    def settle(self, batch: TransitionBatch, steps: int, batch_size: int) -> None:
+        """Go on with the discriminator alone, against a batch of a policy that no longer learns.
 
         While both learn, a discriminator is always behind: for a while even an imitator that fails may fool it. Each of
         the ``steps`` draws ``batch_size`` pairs from either side. The optimizer begins anew: its moments are of a
         policy that moved, and its steps had shrunk.
         """
         self.discriminator.restart_optimizer()
-        policy_pairs = self._policy_pairs(rollouts)
+        policy_pairs = self._policy_pairs(batch)
         rng = numpy_rng(derive_key(self.root_seed, "discriminator", "settle"))
         for _ in range(steps):
             chosen = torch.from_numpy(rng.integers(len(policy_pairs), size=batch_size))
@@ -107,20 +110,42 @@ class AdversarialReward:
         """Return (N,) mean logits of demonstrations by the discriminator as it stands."""
         return mean_logit_per_demonstration(self.discriminator, demonstrations)
 
-    def state(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return the discriminator and its optimizer."""
-        state = {f"net/{name}": value for name, value in self.discriminator.state_dict().items()}
-        return state | {f"optimizer/{name}": value for name, value in self.discriminator.optimizer.state().items()}
+        discriminator = self.discriminator
+        return nested("net", discriminator.state_dict()) | nested("optimizer", discriminator.optimizer.state_dict())
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from `state`."""
-        self.discriminator.load_state_dict({k[4:]: v for k, v in state.items() if k.startswith("net/")})
-        moments = {k[10:]: v for k, v in state.items() if k.startswith("optimizer/")}
-        self.discriminator.optimizer.load_state(moments)
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state_dict`."""
+        self.discriminator.load_state_dict(below("net", state))
+        self.discriminator.optimizer.load_state_dict(below("optimizer", state))
 
-    def _policy_pairs(self, rollouts: list[Rollout]) -> Tensor:
-        """Return B pairs: each state with its successor, step by step, groups side by side."""
-        states = side_by_side([r.observations for r in rollouts])
-        successors = side_by_side([r.next_observations for r in rollouts])
-        dim = states.shape[-1]
-        return self.discriminator.pairs(states.reshape(-1, dim), successors.reshape(-1, dim))
+    def _policy_pairs(self, batch: TransitionBatch) -> Tensor:
+        """Return B pairs: each state with its successor, step by step. They are kept, as an iteration asks twice."""
+        if self._paired is None or self._paired[0] is not batch:
+            shape = len(batch), -1
+            pairs = self.discriminator.pairs(batch.observations.reshape(shape), batch.next_observations.reshape(shape))
+            self._paired = batch, pairs
+        return self._paired[1]
+
+
+def imitator(
+    observation_dim: int,
+    action_dim: int,
+    demonstrations: Demonstrations,
+    weights: NDArray[np.float64],
+    config: GailConfig,
+    seed: int,
+) -> Learner[AdversarialReward]:
+    """Return an untrained learner whose reward is a discriminator's, for demonstrations with (N,) weights.
+
+    Raises ValueError unless the weights are finite, not negative and not all zero, and DataError when the
+    demonstrations' states do not have the imitator's dimensions.
+    """
+    if demonstrations.observation_dim != observation_dim:
+        raise DataError(
+            f"demonstrations have states with {demonstrations.observation_dim} dimensions; the imitator's have "
+            f"{observation_dim}"
+        )
+    reward = AdversarialReward(demonstrations, weights, config.discriminator, seed)
+    return Learner(observation_dim, action_dim, config, reward, seed)

@@ -6,7 +6,7 @@ step. Experts learn from the environment's reward, imitators from a discriminato
 Letters: T steps, G simulators (all groups side by side), B = T * G, S observation, A action.
 """
 
-from typing import Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -15,12 +15,11 @@ from torch import Tensor
 
 from oodil.pipeline.algorithms.advantages import generalized_advantages, standardized
 from oodil.pipeline.algorithms.networks import PolicyNetwork
-from oodil.pipeline.algorithms.optimizer import Adam
-from oodil.pipeline.algorithms.ppo import Ppo
-from oodil.pipeline.algorithms.trpo import Trpo
+from oodil.pipeline.algorithms.policy_optimizer import policy_optimizer
 from oodil.pipeline.algorithms.value import ValueFunction
+from oodil.pipeline.artifacts import below, nested
 from oodil.pipeline.config import TrainingConfig
-from oodil.pipeline.data import Rollout
+from oodil.pipeline.data import TransitionBatch
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.seeding import derive_key, torch_seed
 
@@ -34,17 +33,17 @@ class RewardModel(Protocol):
     def state_moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return mean and standard deviation (S,) of the states ahead, or None to learn them from rollouts."""
 
-    def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:
+    def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
         """Return (T, G) rewards."""
 
-    def update(self, rollouts: list[Rollout], iteration: int, step_scale: float) -> dict[str, float]:
-        """Learn from the iteration's rollouts and return metrics; ``step_scale`` multiplies the step size."""
+    def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
+        """Learn from the iteration's batch and return metrics; ``step_scale`` multiplies the step size."""
 
-    def state(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return everything needed to continue."""
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from `state`."""
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state_dict`."""
 
 
 class EnvReward:
@@ -54,32 +53,30 @@ class EnvReward:
         """Nothing is known beforehand."""
         return None
 
-    def rewards(self, rollouts: list[Rollout]) -> NDArray[np.float32]:
+    def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
         """Return the (T, G) rewards of the environment."""
-        return side_by_side([r.env_rewards for r in rollouts]).astype(np.float32)
+        return batch.env_rewards.astype(np.float32)
 
-    def update(self, rollouts: list[Rollout], iteration: int, step_scale: float) -> dict[str, float]:
+    def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
         """There is nothing to learn."""
         return {}
 
-    def state(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """There is nothing to keep."""
         return {}
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """There is nothing to load."""
 
 
-def side_by_side(parts: list[NDArray]) -> NDArray:
-    """Join the groups' (T, g, ...) arrays to (T, G, ...), in group order."""
-    return np.concatenate(parts, axis=1)
+Reward = TypeVar("Reward", bound=RewardModel)
 
 
-class Learner:
+class Learner(Generic[Reward]):
     """Policy, value function and reward model, and how one iteration changes them."""
 
     def __init__(
-        self, observation_dim: int, action_dim: int, config: TrainingConfig, reward_model: RewardModel, root_seed: int
+        self, observation_dim: int, action_dim: int, config: TrainingConfig, reward_model: Reward, root_seed: int
     ) -> None:
         self.config = config
         self.reward_model = reward_model
@@ -90,11 +87,7 @@ class Learner:
         with torch.no_grad():
             self.policy.log_std.fill_(config.initial_log_std)
         self.value = ValueFunction(observation_dim, config.value, rng)
-        self.policy_optimizer = (
-            Trpo(self.policy, config.policy_optimizer)
-            if config.policy_optimizer.kind == "trpo"
-            else Ppo(self.policy, config.policy_optimizer)
-        )
+        self.policy_optimizer = policy_optimizer(self.policy, config.policy_optimizer)
         moments = reward_model.state_moments()
         self._tracks_moments = config.normalize_observations and moments is None
         if config.normalize_observations and moments is not None:
@@ -105,51 +98,45 @@ class Learner:
         """Return a copy of the present policy, ready to be sent."""
         return self.policy.export()
 
-    def update(self, rollouts: list[Rollout], iteration: int) -> dict[str, float]:
-        """Learn from one iteration's rollouts, given in group order, and return metrics."""
+    def update(self, batch: TransitionBatch, iteration: int) -> dict[str, float]:
+        """Learn from one iteration's batch and return metrics."""
         config = self.config
         step_scale = 1 - iteration / config.num_iterations if config.anneal else 1.0
         rng = torch.Generator().manual_seed(torch_seed(derive_key(self.root_seed, "learner", iteration)))
-        observations = torch.from_numpy(side_by_side([r.observations for r in rollouts]))
-        actions = torch.from_numpy(side_by_side([r.actions for r in rollouts]))
-        log_probs = torch.from_numpy(side_by_side([r.log_probs for r in rollouts]))
-        terminated = side_by_side([r.terminated for r in rollouts])
-        truncated = side_by_side([r.truncated for r in rollouts])
         # Scaled by 1 - discount, values are averages of rewards: of order one, whatever the horizon.
-        rewards = self.reward_model.rewards(rollouts) * np.float32(self._reward_scale)
-        flat = observations.flatten(0, 1)
+        rewards = self.reward_model.rewards(batch) * np.float32(self._reward_scale)
+        observations = torch.from_numpy(batch.observations).flatten(0, 1)
         if self._tracks_moments:
-            self._track(flat)
-        inputs = self.policy.normalize(flat)
-        values, next_values = self._values(inputs, rollouts, terminated | truncated)
+            self._track(observations)
+        inputs = self.policy.normalize(observations)
+        values, next_values = self._values(inputs, batch)
         advantages = generalized_advantages(
-            rewards, values, next_values, terminated, truncated, config.discount, config.gae_lambda
+            rewards, values, next_values, batch.terminated, batch.truncated, config.discount, config.gae_lambda
         )
         metrics = {"reward": float(rewards.mean())}
         metrics |= self.policy_optimizer.update(
-            flat,
-            actions.flatten(0, 1),
-            log_probs.flatten(),
+            observations,
+            torch.from_numpy(batch.actions).flatten(0, 1),
+            torch.from_numpy(batch.log_probs).flatten(),
             torch.from_numpy(standardized(advantages)).flatten(),
             rng,
             step_scale,
         )
         metrics |= self.value.fit(inputs, torch.from_numpy(advantages + values).flatten(), rng)
-        metrics |= self.reward_model.update(rollouts, iteration, step_scale)
+        metrics |= self.reward_model.update(batch, iteration, step_scale)
         return metrics
 
     @torch.no_grad()
-    def _values(
-        self, inputs: Tensor, rollouts: list[Rollout], ended: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _values(self, inputs: Tensor, batch: TransitionBatch) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return (T, G) values of the states, given normalized as ``inputs`` (B, S), and of their successors."""
         # The next state's value is the next row's, but for episode ends and the last row: only those cost a pass.
-        values = self.value(inputs).numpy().reshape(ended.shape)
+        values = self.value(inputs).numpy().reshape(batch.terminated.shape)
         next_values = np.empty_like(values)
         next_values[:-1] = values[1:]
-        apart = ended.copy()
+        apart = batch.ended
         apart[-1] = True
-        next_observations = side_by_side([r.next_observations for r in rollouts])[apart]
-        next_values[apart] = self.value(self.policy.normalize(torch.from_numpy(next_observations))).numpy()
+        successors = self.policy.normalize(torch.from_numpy(batch.next_observations[apart]))
+        next_values[apart] = self.value(successors).numpy()
         return values, next_values
 
     @torch.no_grad()
@@ -165,29 +152,24 @@ class Learner:
         self.policy.input_mean.copy_(mean)
         self.policy.input_scale.copy_(1 / deviation.clamp_min(SMALLEST_DEVIATION))
 
-    def state(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return everything that later iterations depend on, as named tensors."""
         state = {"moments": self._moments}
         for name, part in self._parts().items():
-            state |= {f"{name}/{key}": value for key, value in part.state().items()}
-        for name, module in (("policy", self.policy), ("value", self.value)):
-            state |= {f"{name}/{key}": value for key, value in module.state_dict().items()}
+            state |= nested(name, part.state_dict())
         return state
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from `state`."""
-
-        def below(prefix: str) -> dict[str, Tensor]:
-            return {key[len(prefix) + 1 :]: value for key, value in state.items() if key.startswith(prefix + "/")}
-
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state_dict`."""
         self._moments.copy_(state["moments"])
-        self.policy.load_state_dict(below("policy"))
-        self.value.load_state_dict(below("value"))
         for name, part in self._parts().items():
-            part.load_state(below(name))
+            part.load_state_dict(below(name, state))
 
-    def _parts(self) -> dict[str, RewardModel | Trpo | Ppo | Adam]:
+    def _parts(self) -> dict[str, Any]:
+        """Return everything with a ``state_dict``, by its name in the learner's own."""
         return {
+            "policy": self.policy,
+            "value": self.value,
             "policy_optimizer": self.policy_optimizer,
             "value_optimizer": self.value.optimizer,
             "reward_model": self.reward_model,

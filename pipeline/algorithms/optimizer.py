@@ -22,25 +22,25 @@ class Adam:
     def learning_rate(self, value: float) -> None:
         self._optimizer.param_groups[0]["lr"] = value
 
-    def step(self, loss: Tensor) -> None:
-        """Differentiate ``loss`` and take one step."""
-        self.apply(torch.autograd.grad(loss, self._parameters))
+    def step(self, loss: Tensor, max_grad_norm: float | None = None) -> None:
+        """Take one step down the gradient of ``loss``, which is scaled down to ``max_grad_norm`` if there is one."""
+        self.apply(torch.autograd.grad(loss, self._parameters), max_grad_norm)
 
     def apply(self, gradients: Sequence[Tensor], max_grad_norm: float | None = None) -> None:
-        """Take one step by gradients that are known, one for each parameter."""
+        """Take one step by known gradients, one for each parameter."""
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
         if max_grad_norm is not None:
             torch.nn.utils.clip_grad_norm_(self._parameters, max_grad_norm)
         self._optimizer.step()
 
-    def state(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return the moments and the step count of every parameter; empty before the first step."""
         moments = self._optimizer.state_dict()["state"]
         return {f"{i}.{name}": value for i, entry in moments.items() for name, value in entry.items()}
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from `state`."""
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state_dict`."""
         whole = self._optimizer.state_dict()
         whole["state"] = {}
         for name, value in state.items():

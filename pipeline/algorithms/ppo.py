@@ -25,13 +25,13 @@ class Ppo:
         self.config = config
         self._optimizer = Adam(list(policy.parameters()), config.learning_rate)
 
-    def state(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return the optimizer's moments."""
-        return self._optimizer.state()
+        return self._optimizer.state_dict()
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from `state`."""
-        self._optimizer.load_state(state)
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from `state_dict`."""
+        self._optimizer.load_state_dict(state)
 
     def update(
         self,
@@ -54,13 +54,11 @@ class Ppo:
         kl = 0.0
         for _ in range(config.epochs):
             for chosen in torch.randperm(len(observations), generator=rng).split(config.minibatch_size):
-                layer_inputs = policy.net.layer_inputs(inputs[chosen])
-                mean = policy.net.head(layer_inputs).requires_grad_()
-                new = policy.log_prob(mean, actions[chosen])
+                new = policy.log_prob(policy.net(inputs[chosen]), actions[chosen])
                 old = log_probs[chosen]
                 loss = -clipped_surrogate(new, old, advantages[chosen], config.clip)
                 if config.entropy_bonus:
-                    loss = loss - config.entropy_bonus * policy.log_std.sum()
-                self._optimizer.apply(policy.gradients(loss, mean, layer_inputs), config.max_grad_norm)
+                    loss = loss - config.entropy_bonus * policy.entropy()
+                self._optimizer.step(loss, config.max_grad_norm)
                 kl = float((old - new.detach()).mean())
-        return {"kl": kl, "entropy": float(policy.log_std.detach().sum()) + 1.4189385 * len(policy.log_std)}
+        return {"kl": kl, "entropy": float(policy.entropy().detach())}

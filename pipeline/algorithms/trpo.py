@@ -12,7 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from oodil.pipeline.algorithms.networks import PolicyNetwork
+from oodil.pipeline.algorithms.networks import Linearization, PolicyNetwork
 from oodil.pipeline.config import TrpoConfig
 
 
@@ -45,11 +45,11 @@ class Trpo:
         self._shapes = [p.shape for p in self._parameters]
         self._sizes = [p.numel() for p in self._parameters]
 
-    def state(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return nothing: a step depends on the policy and the batch alone."""
         return {}
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Accept the empty state."""
 
     def update(
@@ -74,25 +74,24 @@ class Trpo:
         config, policy = self.config, self.policy
         max_kl = config.max_kl * step_scale
         inputs = policy.normalize(observations)
-        layer_inputs = policy.net.layer_inputs(inputs)
-        mean = policy.net.head(layer_inputs).requires_grad_()
+        mean = policy.net(inputs)
         surrogate = (torch.exp(policy.log_prob(mean, actions) - log_probs) * advantages).mean()
-        gradient = _flatten(policy.gradients(surrogate, mean, layer_inputs))
+        gradient = _flatten(torch.autograd.grad(surrogate, self._parameters))
         old_mean, old_log_std = mean.detach(), policy.log_std.detach().clone()
-        # Curvature is needed less exactly than the gradient, and its products are the dear part of a step.
-        fewer = [part[:: config.fisher_every].contiguous() for part in layer_inputs]
-        precision = torch.exp(-2 * old_log_std) / len(fewer[0])
+        # Curvature is needed less exactly than the gradient, and its products are the expensive part of a step.
+        linearization = Linearization(policy.net, inputs[:: config.fisher_every].contiguous())
+        precision = torch.exp(-2 * old_log_std) / len(linearization.output)
 
         def fisher_product(vector: Tensor) -> Tensor:
             log_std_tangent, *tangents = self._unflatten(vector)
-            change = policy.net.directional_derivative(fewer, tangents)
-            images = [2 * log_std_tangent, *policy.net.gradients(fewer, change * precision)]
+            change = linearization.output_change(tangents)
+            images = [2 * log_std_tangent, *linearization.gradients(change * precision)]
             return _flatten(images) + config.damping * vector
 
         direction = conjugate_gradient(fisher_product, gradient, config.cg_iterations, config.cg_tolerance)
         curvature = direction @ fisher_product(direction)
         if not bool(torch.isfinite(curvature)) or float(curvature) <= 0:
-            return {"kl": 0.0, "improvement": 0.0, "step_fraction": 0.0, "entropy": _entropy(policy)}
+            return {"kl": 0.0, "improvement": 0.0, "step_fraction": 0.0, "entropy": float(policy.entropy().detach())}
         full_step = torch.sqrt(2 * max_kl / curvature) * direction
         expected = float(gradient @ full_step)
         start = _flatten([p.detach() for p in self._parameters])
@@ -107,10 +106,10 @@ class Trpo:
                 kl = float(_mean_kl(old_mean, old_log_std, new_mean, policy.log_std))
                 if improvement > config.accept_ratio * fraction * expected and kl <= 1.5 * max_kl:
                     metrics = {"kl": kl, "improvement": improvement, "step_fraction": fraction}
-                    return metrics | {"entropy": _entropy(policy)}
+                    return metrics | {"entropy": float(policy.entropy().detach())}
                 fraction *= 0.5
             self._assign(start)
-        return {"kl": 0.0, "improvement": 0.0, "step_fraction": 0.0, "entropy": _entropy(policy)}
+        return {"kl": 0.0, "improvement": 0.0, "step_fraction": 0.0, "entropy": float(policy.entropy().detach())}
 
     def _unflatten(self, vector: Tensor) -> list[Tensor]:
         return [part.view(shape) for part, shape in zip(vector.split(self._sizes), self._shapes, strict=True)]
@@ -122,10 +121,6 @@ class Trpo:
 
 def _flatten(tensors: list[Tensor] | tuple[Tensor, ...]) -> Tensor:
     return torch.cat([t.reshape(-1) for t in tensors])
-
-
-def _entropy(policy: PolicyNetwork) -> float:
-    return float(policy.log_std.detach().sum()) + 1.4189385 * len(policy.log_std)
 
 
 def _mean_kl(old_mean: Tensor, old_log_std: Tensor, new_mean: Tensor, new_log_std: Tensor) -> Tensor:

@@ -60,14 +60,14 @@ class ClusteringStage(Stage):
         for warning in warnings:
             context.warn(warning)
         if state is not None:
-            clustering.load_state(state)
+            clustering.load_state_dict(state)
         saved_at = time.monotonic()
         while clustering.iteration < clustering.num_iterations:
             metrics = clustering.update()
             context.progress(clustering.iteration, clustering.num_iterations, **metrics)
             stop = context.should_stop()
             if stop or time.monotonic() - saved_at >= context.checkpoint_interval_s:
-                checkpoints.save(clustering.iteration, clustering.state())
+                checkpoints.save(clustering.iteration, clustering.state_dict())
                 saved_at = time.monotonic()
             if stop:
                 raise JobStoppedError

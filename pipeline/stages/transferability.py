@@ -58,10 +58,9 @@ class TransferabilityStage(Weighting):
         reward = cluster.reward(config)
         reward.load_discriminator(imitator.discriminator)
         horizon = environment_spec(config.environment.id, config.environment.dynamics).max_episode_steps
-        rollouts = experience(imitator.policy, config.environment, section.gail, horizon, cluster.seed, context)
-        reward.settle(rollouts, section.final_steps, section.gail.steps_per_iteration)
-        env_steps = sum(rollout.terminated.size for rollout in rollouts)
-        history = ScoreHistory.load(trained).then(env_steps, reward.mean_logits(cluster.demonstrations))
+        batch = experience(imitator.policy, config.environment, section.gail, horizon, cluster.seed, context)
+        reward.settle(batch, section.final_steps, section.gail.steps_per_iteration)
+        history = ScoreHistory.load(trained).then(batch.terminated.size, reward.mean_logits(cluster.demonstrations))
         return history.files() | discriminator_file(reward.discriminator_arrays())
 
     def combine(self, run: Run) -> Files:

@@ -144,7 +144,8 @@ def test_the_bottom_stays_at_the_bottom():
         assert ours <= {f"oodil.pipeline.{module}" for module in below}, name
     for path in (ROOT / "pipeline" / "algorithms").rglob("*.py"):
         names = set(imported(parse(str(path.relative_to(ROOT)))))
-        assert not {name for name in names if name.startswith(("oodil.pipeline.stage", "oodil.pipeline.report"))}, path
+        above = ("stage", "report", "training", "collecting", "environments", "evaluation")
+        assert not {name for name in names if name.startswith(tuple(f"oodil.pipeline.{each}" for each in above))}, path
 
 
 @pytest.mark.parametrize(
@@ -197,6 +198,15 @@ def loaded_by(module: str) -> set[str]:
     probe = f"import sys, {module}; print(*{{name.split('.')[0] for name in sys.modules}})"
     result = subprocess.run([sys.executable, "-c", probe], check=True, cwd=ROOT, capture_output=True, text=True)
     return set(result.stdout.split())
+
+
+def test_algorithms_load_no_simulator():
+    """Arrays in, arrays out: whatever collects, the algorithms need neither MuJoCo nor Gymnasium."""
+    names = sorted(path.stem for path in (ROOT / "pipeline" / "algorithms").glob("*.py") if path.stem != "__init__")
+    assert {"learner", "gail", "clustering"} <= set(names)
+    loaded = loaded_by(", ".join(f"oodil.pipeline.algorithms.{name}" for name in names))
+    assert "torch" in loaded
+    assert not loaded & {"mujoco", "gymnasium", "highway_env", "robosuite"}
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,11 @@ from oodil.pipeline.artifacts import (
     MANIFEST,
     Checkpoints,
     RunDirectory,
+    below,
     encode_arrays,
     encode_json,
     fingerprint,
+    nested,
     read_artifact,
     remove_artifact,
     write_artifact,
@@ -315,3 +317,12 @@ def test_the_artifact_of_a_single_job_is_that_of_its_stage(tmp_path):
         run.checkpoints("a", "k0"),
     }
     assert len(places) == 5
+
+
+def test_below_is_the_inverse_of_nested_and_takes_no_other_prefix():
+    first, second = {"a": np.zeros(1), "b/c": np.ones(2)}, {"a": np.full(3, 2.0)}
+    whole = nested("part", first) | nested("parts", second) | {"part": np.zeros(0)}
+    assert set(whole) == {"part/a", "part/b/c", "parts/a", "part"}
+    assert below("part", whole) == first
+    assert below("parts", whole) == second
+    assert below("par", whole) == {}

@@ -1,9 +1,11 @@
 """Demonstrations: their parts, and a message for each bad input that names demonstration, value and limit."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 
-from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.data import Demonstrations, TransitionBatch
 from oodil.pipeline.datasets import decode_demonstrations, encode_demonstrations
 from oodil.pipeline.errors import DataError
 
@@ -95,3 +97,30 @@ def test_equal_demonstrations_are_equal_files(demonstrations):
     assert environment == "oodil/Hopper-v0" and read.source_labels == made.source_labels
     assert read.observations.tobytes() == made.observations.tobytes()
     assert read.offsets.tolist() == made.offsets.tolist()
+
+
+def test_a_batch_is_the_rollouts_side_by_side(rollout):
+    first, second = rollout(0, num_simulators=2), rollout(1, num_simulators=3)
+    first = replace(first, episode_returns=np.array([1.0, 2.0]), episode_lengths=np.array([10, 20]))
+    second = replace(second, episode_returns=np.array([3.0]), episode_lengths=np.array([30]))
+    batch = TransitionBatch.of([first, second])
+    assert len(batch) == 6 * 5
+    assert batch.observations.shape == (6, 5, 3)
+    for field in fields(batch):
+        joined, parts = getattr(batch, field.name), [getattr(part, field.name) for part in (first, second)]
+        if field.name == "policy_version":
+            assert joined == 0
+        elif field.name.startswith("episode"):
+            np.testing.assert_array_equal(joined, np.concatenate(parts))
+        else:
+            assert joined.dtype == parts[0].dtype
+            np.testing.assert_array_equal(joined[:, :2], parts[0], err_msg=field.name)
+            np.testing.assert_array_equal(joined[:, 2:], parts[1], err_msg=field.name)
+    np.testing.assert_array_equal(batch.ended, batch.terminated | batch.truncated)
+
+
+def test_a_batch_has_one_policy_version(rollout):
+    with pytest.raises(ValueError, match=r"one policy version; these have \[0, 3\]"):
+        TransitionBatch.of([rollout(0), replace(rollout(1), policy_version=3)])
+    with pytest.raises(ValueError, match=r"these have \[\]"):
+        TransitionBatch.of([])

@@ -8,14 +8,21 @@ import torch
 from scipy.stats import chisquare
 
 from oodil.pipeline.algorithms.discriminator import imitation_reward
-from oodil.pipeline.algorithms.gail import AdversarialReward
-from oodil.pipeline.config import DiscriminatorConfig
+from oodil.pipeline.algorithms.gail import AdversarialReward, imitator
+from oodil.pipeline.algorithms.learner import Learner
+from oodil.pipeline.config import DiscriminatorConfig, GailConfig
+from oodil.pipeline.data import TransitionBatch
+from oodil.pipeline.errors import DataError
 
 
 def build(demonstrations, weights, **settings):
     return AdversarialReward(
         demonstrations, np.array(weights, np.float64), DiscriminatorConfig(**settings), root_seed=0
     )
+
+
+def batch_of(*rollouts):
+    return TransitionBatch.of(rollouts)
 
 
 def drawn_numbers(pairs):
@@ -74,7 +81,7 @@ def test_rewards_belong_to_the_steps_that_earned_them(demonstrations, rollout):
     """Groups stand side by side: reward [t, g] is that of step t of simulator g."""
     reward = build(demonstrations(5, 5), [1.0, 1.0])
     rollouts = [rollout(0, num_simulators=2), rollout(1, num_simulators=3)]
-    result = reward.rewards(rollouts)
+    result = reward.rewards(batch_of(*rollouts))
     assert result.shape == (6, 5)
     for t in range(6):
         for g, (part, column) in enumerate([(0, 0), (0, 1), (1, 0), (1, 1), (1, 2)]):
@@ -84,21 +91,39 @@ def test_rewards_belong_to_the_steps_that_earned_them(demonstrations, rollout):
             assert result[t, g] == pytest.approx(float(imitation_reward(logit, "positive")[0]), rel=1e-5)
 
 
+def test_pairs_are_built_once_for_a_batch(demonstrations, rollout, monkeypatch):
+    reward = build(demonstrations(20), [1.0])
+    batches = [batch_of(rollout(seed)) for seed in range(2)]
+    built = []
+    pairs = reward.discriminator.pairs
+
+    def count(states, successors):
+        built.append(len(states))
+        return pairs(states, successors)
+
+    monkeypatch.setattr(reward.discriminator, "pairs", count)
+    monkeypatch.setattr(reward, "draw", lambda count, rng: pairs(*2 * [np.ones((count, 3), np.float32)]))
+    for iteration, batch in enumerate(batches):
+        reward.rewards(batch)
+        reward.update(batch, iteration, 1.0)
+        assert built == [18] * (iteration + 1)
+
+
 def test_update_raises_the_reward_of_demonstrations(demonstrations, rollout):
     shown = demonstrations(30, 30)
     reward = build(shown, [1.0, 1.0], learning_rate=1e-2)
     pairs = reward.draw(50, np.random.default_rng(0))
-    rollouts = [rollout(0, num_steps=20)]
+    batch = batch_of(rollout(0, num_steps=20))
 
     def margin():
         with torch.no_grad():
             return float(imitation_reward(reward.discriminator(pairs), "positive").mean()) - float(
-                reward.rewards(rollouts).mean()
+                reward.rewards(batch).mean()
             )
 
     before = margin()
     for iteration in range(20):
-        reward.update(rollouts, iteration, 1.0)
+        reward.update(batch, iteration, 1.0)
     assert margin() > before + 0.1
 
 
@@ -109,7 +134,7 @@ def test_as_many_demonstration_pairs_as_policy_pairs_or_all(
     reward = build(demonstrations(num_states), [1.0])
     counts = []
     monkeypatch.setattr(reward.discriminator, "update", lambda shown, policy: counts.append((len(shown), len(policy))))
-    reward.update([rollout(0, num_steps=num_steps)], 0, 1.0)
+    reward.update(batch_of(rollout(0, num_steps=num_steps)), 0, 1.0)
     # 4 steps of 3 simulators against 39 transitions: 12 of each; 50 steps against 9 transitions: 9 draws.
     assert counts == [(expected, 3 * num_steps)]
 
@@ -118,39 +143,39 @@ def test_an_update_depends_on_the_iteration_and_not_on_what_was_drawn_before(dem
     one, two = (build(demonstrations(20, 20), [1.0, 0.5], steps_per_iteration=3) for _ in range(2))
     two.draw(17, np.random.default_rng(9))
     for iteration in range(2):
-        one.update([rollout(iteration)], iteration, 1.0)
-        two.update([rollout(iteration)], iteration, 1.0)
-    assert_same_bits(one.state(), two.state())
+        one.update(batch_of(rollout(iteration)), iteration, 1.0)
+        two.update(batch_of(rollout(iteration)), iteration, 1.0)
+    assert_same_bits(one.state_dict(), two.state_dict())
 
 
 def test_an_artificial_reward_of_the_environment_changes_nothing(demonstrations, rollout, assert_same_bits):
-    plain = rollout(0)
+    plain = batch_of(rollout(0))
     poisoned = replace(plain, env_rewards=np.full_like(plain.env_rewards, np.nan))
     one, two = (build(demonstrations(20), [1.0]) for _ in range(2))
-    assert_same_bits(one.rewards([plain]), two.rewards([poisoned]))
-    one.update([plain], 0, 1.0)
-    two.update([poisoned], 0, 1.0)
-    assert_same_bits(one.state(), two.state())
+    assert_same_bits(one.rewards(plain), two.rewards(poisoned))
+    one.update(plain, 0, 1.0)
+    two.update(poisoned, 0, 1.0)
+    assert_same_bits(one.state_dict(), two.state_dict())
 
 
 def test_state_restores_another_instance(demonstrations, rollout, assert_same_bits):
     one = build(demonstrations(20), [1.0])
-    one.update([rollout(0)], 0, 1.0)
+    one.update(batch_of(rollout(0)), 0, 1.0)
     two = AdversarialReward(demonstrations(20), np.ones(1), DiscriminatorConfig(), root_seed=0)
-    two.load_state({name: value.clone() for name, value in one.state().items()})
+    two.load_state_dict({name: value.clone() for name, value in one.state_dict().items()})
     for iteration in (1, 2):
-        one.update([rollout(iteration)], iteration, 1.0)
-        two.update([rollout(iteration)], iteration, 1.0)
-    assert_same_bits(one.state(), two.state())
+        one.update(batch_of(rollout(iteration)), iteration, 1.0)
+        two.update(batch_of(rollout(iteration)), iteration, 1.0)
+    assert_same_bits(one.state_dict(), two.state_dict())
 
 
 def test_loading_a_state_does_not_tie_two_instances_together(demonstrations, rollout, assert_same_bits):
     one, two = (build(demonstrations(20), [1.0]) for _ in range(2))
-    one.update([rollout(0)], 0, 1.0)
-    two.load_state(one.state())
-    kept = {name: value.clone() for name, value in one.state().items()}
-    two.update([rollout(1)], 1, 1.0)
-    assert_same_bits(one.state(), kept)
+    one.update(batch_of(rollout(0)), 0, 1.0)
+    two.load_state_dict(one.state_dict())
+    kept = {name: value.clone() for name, value in one.state_dict().items()}
+    two.update(batch_of(rollout(1)), 1, 1.0)
+    assert_same_bits(one.state_dict(), kept)
 
 
 def test_step_scale_multiplies_the_step_size(demonstrations, rollout):
@@ -159,7 +184,7 @@ def test_step_scale_multiplies_the_step_size(demonstrations, rollout):
     def moved(step_scale):
         reward = build(demonstrations(20), [1.0], learning_rate=1e-2)
         before = [p.detach().clone() for p in reward.discriminator.parameters()]
-        reward.update([rollout(0)], 0, step_scale)
+        reward.update(batch_of(rollout(0)), 0, step_scale)
         after = reward.discriminator.parameters()
         return max(float((a.detach() - b).abs().max()) for a, b in zip(after, before, strict=True))
 
@@ -169,10 +194,25 @@ def test_step_scale_multiplies_the_step_size(demonstrations, rollout):
 
 def test_a_settled_discriminator_tells_a_policy_that_no_longer_learns(demonstrations, rollout, assert_same_bits):
     """Demonstrations that the rollouts do not resemble become certain; nothing but the two sides decides the bits."""
-    shown, rollouts = demonstrations(20, 20), [rollout(0, num_steps=30), rollout(1, num_steps=30)]
+    shown, batch = demonstrations(20, 20), batch_of(rollout(0, num_steps=30), rollout(1, num_steps=30))
     one, two = build(shown, [1.0, 1.0], learning_rate=1e-2), build(shown, [1.0, 1.0], learning_rate=1e-2)
     before = one.mean_logits(shown)
-    one.settle(rollouts, steps=100, batch_size=64)
-    two.settle(rollouts, steps=100, batch_size=64)
+    one.settle(batch, steps=100, batch_size=64)
+    two.settle(batch, steps=100, batch_size=64)
     assert (one.mean_logits(shown) > before + 2).all()
-    assert_same_bits(one.state(), two.state())
+    assert_same_bits(one.state_dict(), two.state_dict())
+
+
+def test_an_imitator_is_a_learner_with_an_adversarial_reward(demonstrations, rollout, assert_same_bits):
+    shown, weights, config = demonstrations(20, 20), np.array([1.0, 0.5]), GailConfig(total_steps=100)
+    one = imitator(3, 2, shown, weights, config, seed=7)
+    two = Learner(3, 2, config, AdversarialReward(shown, weights, config.discriminator, 7), 7)
+    for learner in (one, two):
+        learner.update(batch_of(rollout(0)), 0)
+    assert_same_bits(one.state_dict(), two.state_dict())
+    assert one.reward_model.mean_logits(shown).shape == (2,)
+
+
+def test_an_imitator_needs_demonstrations_of_its_own_states(demonstrations):
+    with pytest.raises(DataError, match="states with 3 dimensions; the imitator's have 12"):
+        imitator(12, 3, demonstrations(5), np.ones(1), GailConfig(total_steps=100), seed=0)

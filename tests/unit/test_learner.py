@@ -13,7 +13,7 @@ from oodil.pipeline.algorithms.learner import EnvReward, Learner
 from oodil.pipeline.artifacts import encode_arrays
 from oodil.pipeline.collecting import collect
 from oodil.pipeline.config import DiscriminatorConfig, GailConfig, PpoConfig, TrainingConfig, TrpoConfig, ValueConfig
-from oodil.pipeline.data import Unit
+from oodil.pipeline.data import TransitionBatch, Unit
 from oodil.pipeline.seeding import derive_key
 
 TRPO, PPO = TrpoConfig(), PpoConfig(minibatch_size=40, epochs=2, learning_rate=1e-3)
@@ -58,7 +58,7 @@ def train(learner, first, last, snapshots=(None, None), dynamics=()):
             for group in range(learner.config.num_groups)
         ]
         snapshots = [result.snapshot for result in results]
-        learner.update([result.rollout for result in results], iteration)
+        learner.update(TransitionBatch.of([result.rollout for result in results]), iteration)
     return snapshots
 
 
@@ -86,34 +86,34 @@ def test_interrupted_equals_uninterrupted(shown, assert_same_bits, policy_optimi
     }
     whole = build(**settings)
     snapshots = train(whole, 0, 2)
-    saved = through_a_file(whole.state())
+    saved = through_a_file(whole.state_dict())
     train(whole, 2, 4, snapshots)
 
     resumed = build(**settings)
     train(resumed, 0, 1)  # whatever it was before must not matter
-    resumed.load_state(saved)
+    resumed.load_state_dict(saved)
     train(resumed, 2, 4, snapshots)
-    assert_same_bits(resumed.state(), whole.state())
+    assert_same_bits(resumed.state_dict(), whole.state_dict())
     assert_same_bits(resumed.behavior_policy(), whole.behavior_policy())
-    assert any(not torch.equal(value, saved[name]) for name, value in whole.state().items())
+    assert any(not torch.equal(value, saved[name]) for name, value in whole.state_dict().items())
 
 
 @pytest.mark.parametrize("policy_optimizer", [TRPO, PPO], ids=["trpo", "ppo"])
 def test_a_fresh_state_can_be_saved_and_loaded(shown, assert_same_bits, policy_optimizer):
     one, two = (build(shown, policy_optimizer=policy_optimizer) for _ in range(2))
-    two.load_state(through_a_file(one.state()))
+    two.load_state_dict(through_a_file(one.state_dict()))
     train(one, 0, 1)
     train(two, 0, 1)
-    assert_same_bits(one.state(), two.state())
+    assert_same_bits(one.state_dict(), two.state_dict())
 
 
 def test_every_tensor_of_the_state_is_needed_and_restored(shown, assert_same_bits):
     """No entry is forgotten: a state of other numbers comes back as it is."""
     learner = build(shown, policy_optimizer=PPO, normalize_observations=True)
     train(learner, 0, 2)
-    other = {name: torch.full_like(value, 0.5) for name, value in learner.state().items()}
-    learner.load_state(through_a_file(other))
-    assert_same_bits(dict(learner.state()), other)
+    other = {name: torch.full_like(value, 0.5) for name, value in learner.state_dict().items()}
+    learner.load_state_dict(through_a_file(other))
+    assert_same_bits(dict(learner.state_dict()), other)
     parts = {name.split("/")[0] for name in other}
     assert parts == {"moments", "policy_optimizer", "value_optimizer", "reward_model", "policy", "value"}
 
@@ -124,34 +124,36 @@ def test_imitation_without_a_true_reward_gives_the_same_bits(shown, assert_same_
     plain, poisoned = (build(shown, policy_optimizer=policy_optimizer) for _ in range(2))
     train(plain, 0, 3)
     train(poisoned, 0, 3, dynamics=(("forward_reward_weight", math.nan),))
-    assert_same_bits(poisoned.state(), plain.state())
-    assert all(torch.isfinite(value).all() for value in poisoned.state().values())
+    assert_same_bits(poisoned.state_dict(), plain.state_dict())
+    assert all(torch.isfinite(value).all() for value in poisoned.state_dict().values())
 
 
 def test_an_expert_does_learn_from_the_true_reward(assert_same_bits):
     plain, poisoned = build(), build()
     train(plain, 0, 1)
     train(poisoned, 0, 1, dynamics=(("healthy_reward", 5.0),))
-    assert any(not torch.equal(plain.state()[name], poisoned.state()[name]) for name in plain.state())
+    assert any(not torch.equal(plain.state_dict()[name], poisoned.state_dict()[name]) for name in plain.state_dict())
 
 
 def test_the_order_of_the_groups_is_part_of_the_update(shown, rollout):
     rollouts = [rollout(seed, observation_dim=12) for seed in (0, 1)]
     rollouts = [replace(r, actions=np.concatenate((r.actions, r.actions[..., :1]), axis=2)) for r in rollouts]
     one, two = build(shown), build(shown)
-    one.update(rollouts, 0)
-    two.update(rollouts[::-1], 0)
-    assert any(one.state()[name].numpy().tobytes() != two.state()[name].numpy().tobytes() for name in one.state())
+    one.update(TransitionBatch.of(rollouts), 0)
+    two.update(TransitionBatch.of(rollouts[::-1]), 0)
+    states = one.state_dict(), two.state_dict()
+    assert any(states[0][name].numpy().tobytes() != states[1][name].numpy().tobytes() for name in states[0])
 
 
 def test_the_discriminator_steps_after_the_reward_is_read(shown, rollout):
     """The policy learns from the discriminator as it was when the rollouts were collected."""
     made = rollout(0, observation_dim=12)
     made = replace(made, actions=np.concatenate((made.actions, made.actions[..., :1]), axis=2))
+    batch = TransitionBatch.of([made])
     learner = build(shown)
-    expected = float(learner.reward_model.rewards([made]).mean())
-    assert learner.update([made], 0)["reward"] == pytest.approx(expected, rel=1e-6)
-    assert float(learner.reward_model.rewards([made]).mean()) != pytest.approx(expected, rel=1e-6)
+    expected = float(learner.reward_model.rewards(batch).mean())
+    assert learner.update(batch, 0)["reward"] == pytest.approx(expected, rel=1e-6)
+    assert float(learner.reward_model.rewards(batch).mean()) != pytest.approx(expected, rel=1e-6)
 
 
 def test_values_of_next_states(shown, rollout):
@@ -164,11 +166,11 @@ def test_values_of_next_states(shown, rollout):
         successors[:-1][~ended[:-1]] = r.observations[1:][~ended[:-1]]
         rollouts.append(replace(r, next_observations=successors))
     learner = build(shown, normalize_observations=True)
-    flat = torch.from_numpy(np.concatenate([r.observations for r in rollouts], axis=1)).flatten(0, 1)
+    joined = TransitionBatch.of(rollouts)
+    flat = torch.from_numpy(joined.observations).flatten(0, 1)
     learner._track(flat)
-    ended = np.concatenate([r.terminated | r.truncated for r in rollouts], axis=1)
-    values, next_values = learner._values(learner.policy.normalize(flat), rollouts, ended)
-    successors = torch.from_numpy(np.concatenate([r.next_observations for r in rollouts], axis=1))
+    values, next_values = learner._values(learner.policy.normalize(flat), joined)
+    successors = torch.from_numpy(joined.next_observations)
     with torch.no_grad():
         expected = learner.value(learner.policy.normalize(successors.flatten(0, 1))).view(8, 6).numpy()
         present = learner.value(learner.policy.normalize(flat)).view(8, 6).numpy()
@@ -233,5 +235,5 @@ def test_steps_shrink_linearly_over_the_training(shown, rollout, anneal, expecte
     )
     learner = Learner(3, 2, config, Recording(), 0)
     for iteration in range(4):
-        learner.update([rollout(iteration)], iteration)
+        learner.update(TransitionBatch.of([rollout(iteration)]), iteration)
     assert Recording.scales == expected

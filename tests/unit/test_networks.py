@@ -1,67 +1,95 @@
-"""The networks: forward-mode derivative, initial weights, and the trip to NumPy and back."""
+"""The networks: derivatives of every kind, initial weights, and the trip to NumPy and back."""
 
 import numpy as np
 import pytest
 import torch
+from torch.autograd import gradcheck, gradgradcheck
 from torch.distributions import Independent, Normal
 from torch.func import jvp
 
-from oodil.pipeline.algorithms.networks import MLP, PolicyNetwork
+from oodil.pipeline.algorithms.networks import MLP, Linearization, Tanh
 
 
-class NumpyTanh(torch.autograd.Function):
-    """NumPy's tanh for autograd."""
-
-    @staticmethod
-    def forward(ctx, x):
-        y = torch.from_numpy(np.tanh(x.detach().numpy()))
-        ctx.save_for_backward(y)
-        return y
-
-    @staticmethod
-    def backward(ctx, gradient):
-        (y,) = ctx.saved_tensors
-        return torch.ops.aten.tanh_backward(gradient, y)
+def test_tanh_can_be_differentiated_twice_and_in_forward_mode():
+    x = torch.linspace(-3, 3, 12, dtype=torch.float64).view(4, 3).requires_grad_()
+    assert gradcheck(Tanh.apply, x, check_forward_ad=True)
+    assert gradgradcheck(Tanh.apply, x)
+    torch.testing.assert_close(Tanh.apply(x), torch.tanh(x), rtol=1e-14, atol=1e-15)
 
 
-def test_directional_derivative_equals_forward_mode_autodiff(plain_mlp):
+def test_tanh_has_the_derivatives_of_torch():
     rng = torch.Generator().manual_seed(0)
-    for hidden in ((7,), (5, 6), (4, 3, 2)):
-        net = MLP(3, hidden, 2, rng).double()
-        x = torch.randn(11, 3, generator=rng, dtype=torch.float64)
-        parameters = list(net.parameters())
-        tangents = [torch.randn(p.shape, generator=rng, dtype=torch.float64) for p in parameters]
-        _, expected = jvp(lambda p: plain_mlp(p, x), (parameters,), (tangents,))  # noqa: B023
-        result = net.directional_derivative(net.layer_inputs(x), tangents)
-        torch.testing.assert_close(result, expected, rtol=1e-10, atol=1e-12)
+    x = torch.randn(50, generator=rng, dtype=torch.float64).requires_grad_()
+    derivatives = {}
+    for tanh in (Tanh.apply, torch.tanh):
+        (first,) = torch.autograd.grad(tanh(x).sum(), x, create_graph=True)
+        (second,) = torch.autograd.grad(first.square().sum(), x, create_graph=True)
+        (third,) = torch.autograd.grad(second.sum(), x)
+        derivatives[tanh] = (first, second, third)
+    for own, expected in zip(*derivatives.values(), strict=True):
+        torch.testing.assert_close(own, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_a_gradient_penalty_has_the_gradients_of_torch(plain_mlp):
+    """The penalty is of the gradient with respect to the input; its own gradient is with respect to the parameters."""
+    rng = torch.Generator().manual_seed(0)
+    net = MLP(6, (9, 8), 1, rng).double()
+    parameters = list(net.parameters())
+    x = torch.randn(20, 6, generator=rng, dtype=torch.float64)
+
+    def penalty(network):
+        inputs = x.clone().requires_grad_()
+        (slope,) = torch.autograd.grad(network(inputs).sum(), inputs, create_graph=True)
+        return slope.square().sum(-1).mean()
+
+    own, expected = penalty(net), penalty(lambda inputs: plain_mlp(parameters, inputs))
+    assert own.item() > 0
+    torch.testing.assert_close(own, expected, rtol=1e-12, atol=1e-14)
+    # The last bias has no part in the slope.
+    own_gradients, expected_gradients = (
+        torch.autograd.grad(each, parameters, allow_unused=True, materialize_grads=True) for each in (own, expected)
+    )
+    assert all(gradient.abs().max() > 1e-6 for gradient in own_gradients[:-1])
+    torch.testing.assert_close(own_gradients, expected_gradients, rtol=1e-10, atol=1e-12)
+
+
+def test_a_gradient_penalty_passes_a_numerical_check():
+    rng = torch.Generator().manual_seed(0)
+    net = MLP(3, (4, 5), 2, rng).double()
+    with torch.no_grad():
+        net.layers[-1].weight.mul_(10)
+    x = torch.randn(7, 3, generator=rng, dtype=torch.float64, requires_grad=True)
+    parameters = [p.detach().clone().requires_grad_() for p in net.parameters()]
+    names = [name for name, _ in net.named_parameters()]
+
+    def output(x, *values):
+        return torch.func.functional_call(net, dict(zip(names, values, strict=True)), x)
+
+    assert gradcheck(output, (x, *parameters))
+    assert gradgradcheck(output, (x, *parameters))
+
+
+@pytest.mark.parametrize("hidden", [(7,), (5, 6), (4, 3, 2)])
+def test_output_change_equals_forward_mode_autodiff(plain_mlp, hidden):
+    rng = torch.Generator().manual_seed(0)
+    net = MLP(3, hidden, 2, rng).double()
+    x = torch.randn(11, 3, generator=rng, dtype=torch.float64)
+    parameters = list(net.parameters())
+    tangents = [torch.randn(p.shape, generator=rng, dtype=torch.float64) for p in parameters]
+    _, expected = jvp(lambda p: plain_mlp(p, x), (parameters,), (tangents,))
+    torch.testing.assert_close(Linearization(net, x).output_change(tangents), expected, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize(("batch", "inputs", "outputs"), [(256, 12, 1), (640, 12, 3), (5120, 24, 1), (7, 3, 2)])
-def test_output_and_gradients_have_the_bits_of_autograd(plain_mlp, batch, inputs, outputs):
+def test_a_linearization_has_the_bits_of_autograd(batch, inputs, outputs):
     rng = torch.Generator().manual_seed(0)
     for hidden in ((64, 64), (5,), (9, 8, 7)):
         net = MLP(inputs, hidden, outputs, rng)
         x, flowing = torch.randn(batch, inputs, generator=rng), torch.randn(batch, outputs, generator=rng)
-        parameters = list(net.parameters())
-        output = plain_mlp(parameters, x, NumpyTanh.apply)
-        assert torch.equal(net(x), output)
-        layer_inputs = net.layer_inputs(x)
-        assert torch.equal(net.head(layer_inputs), output)
-        expected = torch.autograd.grad(output, parameters, flowing)
-        assert all(map(torch.equal, net.gradients(layer_inputs, flowing), expected))
-
-
-def test_a_policys_gradients_are_those_of_autograd(plain_mlp, network, batch):
-    policy = network().double()
-    observations, actions, _, _ = batch(policy, 50)
-    inputs, (log_std, *parameters) = policy.normalize(observations), policy.parameters()
-    expected = torch.autograd.grad(
-        policy.log_prob(plain_mlp(parameters, inputs), actions).square().mean(), [log_std, *parameters]
-    )
-    layer_inputs = policy.net.layer_inputs(inputs)
-    mean = policy.net.head(layer_inputs).requires_grad_()
-    result = policy.gradients(policy.log_prob(mean, actions).square().mean(), mean, layer_inputs)
-    torch.testing.assert_close(result, list(expected), rtol=1e-10, atol=1e-12)
+        output, linearization = net(x), Linearization(net, x)
+        assert torch.equal(linearization.output, output)
+        expected = torch.autograd.grad(output, list(net.parameters()), flowing)
+        assert all(map(torch.equal, linearization.gradients(flowing), expected))
 
 
 def test_mlp_is_linear_layers_with_tanh_between():
@@ -95,6 +123,12 @@ def test_log_prob_equals_torch_distributions(network, batch):
         torch.testing.assert_close(shifted, gaussian.log_prob(actions + 1), rtol=1e-4, atol=1e-5)
 
 
+def test_entropy_equals_torch_distributions(network):
+    policy = network(action_dim=3)
+    gaussian = Independent(Normal(torch.zeros(3), policy.log_std.detach().exp()), 1)
+    torch.testing.assert_close(policy.entropy().detach(), gaussian.entropy())
+
+
 def test_exported_policy_has_the_same_mean(network, batch):
     policy = network(observation_dim=12, action_dim=3, hidden=(64, 64))
     observations = batch(policy, 100)[0]
@@ -104,13 +138,6 @@ def test_exported_policy_has_the_same_mean(network, batch):
     assert result.dtype == np.float32
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(result, expected, rtol=1e-4, atol=1e-5)
-
-
-def test_load_is_the_inverse_of_export(network, assert_same_bits):
-    policy = network(seed=1)
-    copy = PolicyNetwork(4, 2, (8, 8), torch.Generator().manual_seed(99))
-    copy.load(policy.export())
-    assert_same_bits(dict(policy.state_dict()), dict(copy.state_dict()))
 
 
 @pytest.mark.parametrize(("observation_dim", "action_dim", "hidden"), [(4, 2, (8,)), (3, 1, (8, 8)), (1, 1, (1, 1))])
