@@ -13,7 +13,7 @@ from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import environment_spec
-from oodil.pipeline.results import Assignment, Imitator, ScoreHistory, TrainedImitators
+from oodil.pipeline.results import Arrays, Assignment, Imitator, ScoreHistory, TrainedImitators
 from oodil.pipeline.seeding import derive_key, torch_seed
 from oodil.pipeline.stage import JobContext, Run, Stage, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
@@ -38,12 +38,15 @@ class ClusterJob:
         seed = torch_seed(derive_key(run.config.seed, "transferability", job))
         return cls(members, load_demonstrations(run).select(members), seed)
 
-    def reward(self, config: RunConfig) -> "AdversarialReward":
-        """Return a fresh discriminator as reward model; all demonstrations of a cluster weigh the same."""
+    def reward(self, config: RunConfig, discriminator: Arrays) -> "AdversarialReward":
+        """Return the reward model of a trained discriminator."""
         from oodil.pipeline.algorithms.gail import AdversarialReward
 
         weights = np.ones(len(self.members))
-        return AdversarialReward(self.demonstrations, weights, config.transferability.gail.discriminator, self.seed)
+        section = config.transferability.gail.discriminator
+        reward = AdversarialReward(self.demonstrations, weights, section, self.seed)
+        reward.load_discriminator(discriminator)
+        return reward
 
 
 class ImitatorsStage(Stage):
@@ -70,19 +73,20 @@ class ImitatorsStage(Stage):
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Imitate one cluster, and note what the discriminator says of its demonstrations along the way."""
-        from oodil.pipeline.algorithms.learner import Learner
+        from oodil.pipeline.algorithms.gail import imitator
         from oodil.pipeline.training import Probe, train
 
         config, gail = run.config, run.config.transferability.gail
         cluster = ClusterJob.of(run, job)
-        reward = cluster.reward(config)
         spec = environment_spec(config.environment.id, config.environment.dynamics)
-        learner = Learner(spec.observation_dim, spec.action_dim, gail, reward, cluster.seed)
+        weights = np.ones(len(cluster.members))  # All demonstrations of a cluster weigh the same.
+        learner = imitator(spec.observation_dim, spec.action_dim, cluster.demonstrations, weights, gail, cluster.seed)
+        reward = learner.reward_model
         probe = Probe("logits", config.evaluation.num_scores, lambda: reward.mean_logits(cluster.demonstrations))
         seen = train(learner, config.environment, gail, [probe], context, self.checkpoints(run, job))
         history = ScoreHistory(cluster.members.astype(np.int64), seen.steps("logits"), seen.values("logits"))
-        imitator = Imitator(learner.behavior_policy(), reward.discriminator_arrays())
-        return imitator.files() | history.files()
+        trained = Imitator(learner.behavior_policy(), reward.discriminator_arrays())
+        return trained.files() | history.files()
 
     def combine(self, run: Run) -> Files:
         """List the trained imitators, and add up what they took."""

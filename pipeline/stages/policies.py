@@ -57,8 +57,7 @@ class PolicyStage(Stage):
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Train the policy and evaluate it with its mean action."""
-        from oodil.pipeline.algorithms.gail import AdversarialReward
-        from oodil.pipeline.algorithms.learner import Learner
+        from oodil.pipeline.algorithms.gail import imitator
         from oodil.pipeline.training import Probe, train
 
         config, evaluation = run.config, run.config.evaluation
@@ -66,8 +65,8 @@ class PolicyStage(Stage):
         spec = environment_spec(environment.id, environment.dynamics)
         # The same seed for all policies: they differ in their weights alone.
         seed = torch_seed(derive_key(config.seed, "imitation"))
-        reward = AdversarialReward(load_demonstrations(run), self.weights(run), gail.discriminator, seed)
-        learner = Learner(spec.observation_dim, spec.action_dim, gail, reward, seed)
+        demonstrations, weights = load_demonstrations(run), self.weights(run)
+        learner = imitator(spec.observation_dim, spec.action_dim, demonstrations, weights, gail, seed)
 
         def curve_point() -> NDArray[np.float64]:
             policy, key = learner.behavior_policy(), derive_key(config.seed, "curve")
@@ -88,7 +87,7 @@ class PolicyStage(Stage):
         curve = LearningCurve(history.steps("curve"), mean, std, length, evaluation.episodes)
         key = derive_key(config.seed, "final")
         final = evaluate(policy.gaussian, environment.id, environment.dynamics, evaluation.final_episodes, key)
-        discriminator = discriminator_file(reward.discriminator_arrays())
+        discriminator = discriminator_file(learner.reward_model.discriminator_arrays())
         return policy.files() | discriminator | curve.files() | final.files()
 
 

@@ -55,8 +55,7 @@ class TransferabilityStage(Weighting):
         cluster = ClusterJob.of(run, job)
         trained = run.job_artifact(ImitatorsStage.name, job)
         imitator = Imitator.load(trained)
-        reward = cluster.reward(config)
-        reward.load_discriminator(imitator.discriminator)
+        reward = cluster.reward(config, imitator.discriminator)
         horizon = environment_spec(config.environment.id, config.environment.dynamics).max_episode_steps
         batch = experience(imitator.policy, config.environment, section.gail, horizon, cluster.seed, context)
         reward.settle(batch, section.final_steps, section.gail.steps_per_iteration)
@@ -93,8 +92,8 @@ class TransferabilityStage(Weighting):
             jobs = by_cluster[cluster]
             readings = {job: ScoreHistory.load(run.job_artifact(self.name, job)) for job in jobs}
             job = _closest(readings)
-            reward = ClusterJob.of(run, job).reward(run.config)
-            reward.load_discriminator(load_discriminator(run.job_artifact(self.name, job)))
+            settled = load_discriminator(run.job_artifact(self.name, job))
+            reward = ClusterJob.of(run, job).reward(run.config, settled)
             members = np.flatnonzero(labels == cluster)
             logits[members] = reward.mean_logits(demonstrations.select(members))
         return self._weighted(run, demonstrations, logits, labels, 0, {})
