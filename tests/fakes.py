@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
 from oodil.pipeline.artifacts import Files, RunDirectory, encode_arrays
 from oodil.pipeline.collecting import RolloutSource, nothing_follows
@@ -17,6 +18,7 @@ from oodil.pipeline.loading import parse_config
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.seeding import derive_key
 from oodil.pipeline.stage import JobContext, JobStoppedError, Run, Stage, register
+from oodil.workers import fork_server
 from oodil.workers.reports import AttemptFailed, Event
 
 NUM_GROUPS = 4
@@ -159,6 +161,21 @@ def failures(events: list[Event]) -> list[tuple[str, int, bool]]:
         for event in events
         if isinstance(event.report, AttemptFailed)
     ]
+
+
+def children() -> list[psutil.Process]:
+    """Return the living children of this process and their children, fork servers without children left out."""
+    servers = {server.pid for server in fork_server.started()}
+    found = psutil.Process().children(recursive=True)
+    return [child for child in found if child.pid not in servers and is_alive(child.pid)]
+
+
+def is_alive(pid: int) -> bool:
+    """Return whether a process is there and not a zombie."""
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 def note(path: Path, line: str) -> None:

@@ -1,6 +1,5 @@
 """Pendulums that misbehave, as told by files: each file is one misdeed, done once."""
 
-import multiprocessing
 import os
 import random
 import signal
@@ -25,7 +24,7 @@ def allow(folder: Path, number: int) -> None:
 
 
 class FlakyPendulum(PendulumEnv):
-    """Pendulum-v1 with misdeeds now and then in child processes, not drawn from its seed."""
+    """Pendulum-v1 with misdeeds now and then, not drawn from its seed; none in the leader of a session, a `LiveRun`."""
 
     def step(self, u: Any) -> Any:
         misdeed = self._misdeed()
@@ -41,7 +40,7 @@ class FlakyPendulum(PendulumEnv):
         return (np.full(3, np.nan, np.float32), *outcome[1:]) if misdeed == "nan" else outcome
 
     def _misdeed(self) -> str:
-        if random.SystemRandom().random() > CHANCE or multiprocessing.parent_process() is None:
+        if random.SystemRandom().random() > CHANCE or os.getsid(0) == os.getpid():
             return ""
         for file in sorted(Path(os.environ[FOLDER_VARIABLE]).iterdir()):
             try:

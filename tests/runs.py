@@ -52,6 +52,11 @@ class LiveRun:
                 continue
         return found
 
+    def fork_server(self) -> psutil.Process:
+        """Return the process from which the others are forked."""
+        (server,) = psutil.Process(self.process.pid).children()
+        return server
+
     def child(self, log_prefix: str) -> psutil.Process:
         """Wait for the child whose log begins with ``log_prefix``, such as ``imitation-rollout-worker-0``."""
 

@@ -19,6 +19,16 @@ from oodil.workers.reports import Event, Failed, Finished, Progress, Replaced, S
 from oodil.workers.supervisor import Supervisor
 
 _WORKER = "rollout-worker-"
+_PRELOAD = (
+    "oodil.workers.job",
+    "oodil.workers.zmq_rollouts",
+    "oodil.workers.rollout_worker",
+    "oodil.pipeline.stages",
+    "oodil.pipeline.training",
+    "oodil.pipeline.algorithms.gail",
+    "oodil.pipeline.algorithms.learner",
+)
+"""What children have loaded from the start: what they compute with, torch above all."""
 
 
 class LocalEngine:
@@ -46,7 +56,7 @@ class LocalEngine:
             return ledger.outcome()
         with (
             private_endpoint(run.directory.path) if stage.distributed else nullcontext("") as endpoint,
-            Supervisor(run.directory.logs(), stage.name) as supervisor,
+            Supervisor(run.directory.logs(), stage.name, _PRELOAD) as supervisor,
         ):
             path = str(run.directory.path.absolute())
             arguments = {"run_path": path, "stage": stage.name, "module": stage.module}

@@ -1,13 +1,13 @@
-"""Child processes: starting, watching and ending them; the only file that starts any.
+"""Child processes: watching and ending them; `oodil.workers.fork_server` starts them.
 
 Parent and child share a pipe that carries encoded reports and nothing else. The child watches its end: when the parent
-is gone, however it died, the pipe closes and the child ends at once. Whether something is started again is for the
-caller to decide (`oodil.workers.engine.Attempts`).
+is gone, however it died, the pipe closes and the child ends at once, as it does when the fork server is gone. Whether
+something is started again is for the caller to decide (`oodil.workers.engine.Attempts`).
 """
 
 import faulthandler
+import importlib
 import logging
-import multiprocessing
 import os
 import signal
 import sys
@@ -15,48 +15,43 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing import connection, resource_tracker
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
+from oodil.workers.fork_server import Connection, Process, fork_server, wait
 from oodil.workers.reports import Event, Failed, Finished, Report, Started, Stop, decode_report, encode_report
 from oodil.workers.wire import MessageError, shortened
 
 _MAX_REPORT_BYTES = 1024 * 1024
 _TERMINATE_S = 2.0
 """How long a child may take to follow SIGTERM before it is killed."""
+_KILL_S = 5.0
+"""How long the kernel may take to end a child that is killed."""
 _GRACE_S = 5.0
 """How long children may take to end when asked at the end of a run."""
-_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-_context = multiprocessing.get_context("spawn")
 
-Pipe = connection.Connection
+PRELOAD = ("oodil.workers.rollout_worker",)
+"""What children have loaded unless told otherwise."""
+
 Main = Callable[..., str]
-"""A child's main function: called with its Link and plain keyword arguments; returns its outcome."""
+"""A child's main function, at the top of a module: called with its Link and texts by name; returns its outcome."""
 
 
 @dataclass
 class _Process:
     """One start of a child."""
 
-    process: SpawnProcess
-    pipe: Pipe
+    process: Process
     log: Path
     last_words: Finished | Failed | None = None
 
     def say(self, report: Report) -> None:
         with suppress(OSError):  # It may be gone; `poll` will say so.
-            self.pipe.send_bytes(encode_report(report))
-
-    def close(self) -> None:
-        self.process.join()
-        self.process.close()
-        self.pipe.close()
+            self.process.link.send_bytes(encode_report(report))
 
 
 @dataclass
@@ -75,7 +70,8 @@ class _Child:
 class Supervisor:
     """The children of one stage. Use it as a context manager: at its end no child is left."""
 
-    def __init__(self, logs: Path, prefix: str) -> None:
+    def __init__(self, logs: Path, prefix: str, preload: tuple[str, ...] = PRELOAD) -> None:
+        self._server = fork_server(preload)
         self._logs = logs
         self._prefix = prefix
         self._children: dict[str, _Child] = {}
@@ -116,7 +112,7 @@ class Supervisor:
         self._wait(0.0 if events else max(timeout_s, 0.0))
         for child, running in self._running():
             # Asked in this order, everything that a dead child said has arrived.
-            is_dead = not running.process.is_alive()
+            is_dead = running.process.poll() is not None
             events += [Event(child.name, report) for report in _received(running)]
             if is_dead:
                 events.append(Event(child.name, self._ended(child, running)))
@@ -135,7 +131,7 @@ class Supervisor:
         """Kill the child that is named by ``<name>.<attempt>``; other attempts are left alone."""
         for child, running in self._running():
             if f"{child.name}.{child.attempt}" == identity:
-                running.process.kill()
+                running.process.signal(signal.SIGKILL)
 
     def close(self, grace_s: float) -> None:
         """End all children: ask, wait, terminate, kill. Bounded, and harmless when repeated."""
@@ -144,11 +140,13 @@ class Supervisor:
             running.say(Stop())
         _join(processes, grace_s)
         for running in processes:
-            running.process.terminate()
+            running.process.signal(signal.SIGTERM)
         _join(processes, _TERMINATE_S)
         for running in processes:
-            running.process.kill()
-            running.close()
+            running.process.signal(signal.SIGKILL)
+        _join(processes, _KILL_S)
+        for running in processes:
+            running.process.close()
         self._children.clear()
 
     def _running(self) -> list[tuple[_Child, _Process]]:
@@ -156,48 +154,44 @@ class Supervisor:
 
     def _wait(self, timeout_s: float) -> None:
         running = [running for _, running in self._running()]
-        handles = [process.pipe for process in running] + [process.process.sentinel for process in running]
+        handles: list[Any] = [each.process for each in running] + [each.process.link for each in running]
         # With no child to wait for, wait() returns at once.
-        connection.wait(handles, timeout_s) if handles else time.sleep(timeout_s)
+        wait(handles, timeout_s) if handles else time.sleep(timeout_s)
 
     def _launch(self, child: _Child) -> None:
         self._logs.mkdir(parents=True, exist_ok=True)
         log = self._logs / f"{self._prefix}-{child.name}.{child.attempt}.log"
-        pipe, childs_end = _context.Pipe()
-        link = (childs_end, str(log), f"{child.name}.{child.attempt}")
-        process = _context.Process(
-            target=_child_main, args=(*link, child.main, child.arguments), name=child.name, daemon=True
-        )
-        with _environment_of_children():
-            process.start()
-        childs_end.close()
-        child.running = _Process(process, pipe, log)
+        arguments = {
+            "log": str(log),
+            "identity": f"{child.name}.{child.attempt}",
+            "main": f"{child.main.__module__}:{child.main.__qualname__}",
+            "arguments": child.arguments,
+        }
+        child.running = _Process(self._server.start(_child_main, arguments), log)
 
     def _ended(self, child: _Child, running: _Process) -> Finished | Failed:
-        exit_code = running.process.exitcode
-        assert exit_code is not None
-        running.close()
+        running.process.close()
         del self._children[child.name]
-        return running.last_words or Failed(f"{_describe(exit_code)}; its log is {running.log}")
+        return running.last_words or Failed(f"{running.process.describe_end()}; its log is {running.log}")
 
 
 def _received(running: _Process) -> list[Report]:
     """Return what a child said, and remember its last words."""
-    reports: list[Report] = []
+    process, reports = running.process, list[Report]()
     try:
-        while running.pipe.poll():
-            report = decode_report(running.pipe.recv_bytes(_MAX_REPORT_BYTES))
+        while process.link.poll():
+            report = decode_report(process.link.recv_bytes(_MAX_REPORT_BYTES))
             if isinstance(report, Finished | Failed):
                 running.last_words = report
             else:
                 reports.append(report)
     except (EOFError, OSError):
         # It is just about to end. If it is not, it cannot be supervised any more.
-        running.process.join(_TERMINATE_S)
-        running.process.kill()
+        if process.join(_TERMINATE_S) is None:
+            process.signal(signal.SIGKILL)
     except MessageError as error:
         running.last_words = Failed(f"the child sent something that is no report: {error}")
-        running.process.kill()
+        process.signal(signal.SIGKILL)
     return reports
 
 
@@ -207,41 +201,14 @@ def _join(processes: list[_Process], timeout_s: float) -> None:
         running.process.join(max(0.0, deadline - time.monotonic()))
 
 
-def _describe(exit_code: int) -> str:
-    if exit_code >= 0:
-        return f"ended with exit code {exit_code} before it was done"
-    try:
-        return f"killed by {signal.Signals(-exit_code).name}"
-    except ValueError:
-        return f"killed by signal {-exit_code}"
-
-
-@contextmanager
-def _environment_of_children() -> Iterator[None]:
-    """Let processes that start here compute with one thread, and not be interrupted before they can say so."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    # Starting the tracker unblocks signals, so it must run before they are blocked.
-    resource_tracker.ensure_running()
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    os.environ.update(_ONE_THREAD)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
 class Link:
-    """A child's end of the pipe to its parent."""
+    """A child's end of the pipe to its parent; ``server`` is a pipe that ends with the fork server."""
 
-    def __init__(self, pipe: Pipe, identity: str) -> None:
+    def __init__(self, pipe: Connection, server: int, identity: str) -> None:
         self.identity = identity
         """Name and attempt: no two processes of a stage share it."""
         self._pipe = pipe
+        self._server = server
         self._stop = threading.Event()
         self._sending = threading.Lock()
         threading.Thread(target=self._listen, daemon=True).start()
@@ -260,10 +227,13 @@ class Link:
 
     def _listen(self) -> None:
         while True:
+            ready = wait([self._pipe, self._server])
             try:
+                if self._server in ready:
+                    raise EOFError
                 report = decode_report(self._pipe.recv_bytes(_MAX_REPORT_BYTES))
             except (EOFError, OSError):
-                # The parent is gone. Nobody would read a result, so nothing is tidied up.
+                # The parent or the server is gone. Nobody would read a result, so nothing is tidied up.
                 os._exit(1)
             assert isinstance(report, Stop)
             self._stop.set()
@@ -276,24 +246,31 @@ def _compute_in_batches() -> None:
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def _child_main(pipe: Pipe, log: str, identity: str, main: Main, arguments: dict[str, str]) -> None:
-    # A terminal sends Ctrl-C to all of them; the parent alone decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+def _name_process(name: str) -> None:
+    """Let Linux show a name of at most 15 bytes in lists of processes."""
+    with suppress(OSError), open("/proc/self/comm", "wb") as file:
+        file.write(name.encode()[:15])
+
+
+def _child_main(link: int, server: int, log: str, identity: str, main: str, arguments: dict[str, str]) -> None:
+    """What every child runs. It ignores Ctrl-C, as the fork server does; the parent alone decides what that means."""
     with open(log, "ab") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     faulthandler.enable()
+    _name_process(identity)
     _compute_in_batches()
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
-    link = Link(pipe, identity)
+    parent = Link(Connection(link), server, identity)
     try:
-        link.send(Finished(main(link, **arguments)))
+        module, _, function = main.partition(":")
+        called: Main = getattr(importlib.import_module(module), function)
+        parent.send(Finished(called(parent, **arguments)))
         exit_code = 0
     except BaseException:
         text = traceback.format_exc()
         logging.error("%s", text)
-        link.send(Failed(shortened(text)))
+        parent.send(Failed(shortened(text)))
         exit_code = 1
     # What a library does at the end of the interpreter must not undo what was reported.
     sys.stdout.flush()

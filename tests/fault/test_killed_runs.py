@@ -72,6 +72,18 @@ def test_kill_one_child(undisturbed: dict[str, str], tmp_path: Path, stage: str,
     assert artifacts(tmp_path / "run") == undisturbed
 
 
+def test_kill_the_fork_server(undisturbed: dict[str, str], tmp_path: Path) -> None:
+    live = start(tmp_path / "run", 2)
+    for stage, job in (("transferability", "cluster-0"), ("imitation", "imitation")):
+        wait_for(has_checkpoint(tmp_path / "run", stage, job, 4), "checkpoint")
+        live.fork_server().kill()
+    code, output = live.finish()
+    assert code == 0, output
+    assert "its fork server died" in output
+    nothing_left(live)
+    assert artifacts(tmp_path / "run") == undisturbed
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_checkpoints_and_stops(
     undisturbed: dict[str, str], tmp_path: Path, number: signal.Signals

@@ -1,6 +1,5 @@
 """Rollout workers that die, hang, raise, repeat themselves or belong to somebody else."""
 
-import multiprocessing
 import os
 import signal
 import threading
@@ -32,7 +31,7 @@ from oodil.workers.messages import (
 from oodil.workers.reports import Event, Failed, Started
 from oodil.workers.supervisor import Supervisor
 from oodil.workers.zmq_rollouts import ZmqRollouts
-from tests.fakes import chain, hopper_units, wait_until
+from tests.fakes import chain, children, hopper_units, wait_until
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -308,8 +307,7 @@ def test_a_worker_process_that_dies_or_hangs_is_replaced_and_changes_nothing(
             supervisor.start("worker", rollout_worker.main, arguments)
             supervisor.poll(0.0)
             wait_until(lambda: bool(rollouts._dispatcher._workers))
-            (process,) = multiprocessing.active_children()
-            assert process.pid is not None
+            (process,) = children()
             # Suspended first, so that it certainly holds units which it will never answer.
             os.kill(process.pid, signal.SIGSTOP)
             rollouts.submit(units)

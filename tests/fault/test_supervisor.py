@@ -1,22 +1,23 @@
 """Children that are killed, hang or are orphaned, with real processes and real signals."""
 
-import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from oodil.workers.channels import endpoint_folder
 from oodil.workers.local_engine import LocalEngine
 from oodil.workers.reports import AttemptFailed, Event, Failed, Finished, Progress, Replaced, Started, Warn
 from oodil.workers.supervisor import Link, Supervisor
-from tests.fakes import FakeStage, failures, fake_run, lines, wait_until
+from tests.fakes import FakeStage, children, failures, fake_run, is_alive, lines, wait_until
 
 pytestmark = pytest.mark.timeout(120)
 ROOT = Path(__file__).parents[2]
@@ -70,14 +71,6 @@ def started(supervisor: Supervisor) -> int:
     """Return the process id that a child says when it is up."""
     pid: int = poll_until(supervisor, Progress).done
     return pid
-
-
-def is_alive(pid: int) -> bool:
-    """Return whether a process is there and not a zombie."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def test_a_child_computes_with_one_thread_and_writes_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,7 +127,7 @@ def test_closing_ends_every_child_and_can_be_repeated(tmp_path: Path, main: obje
     supervisor.close(grace_s=0.2)
     supervisor.close(grace_s=0.2)
     assert not is_alive(pid)
-    assert not multiprocessing.active_children()
+    assert not children()
 
 
 def test_only_the_named_attempt_is_killed(tmp_path: Path) -> None:
@@ -196,20 +189,22 @@ def test_workers_that_keep_dying_fail_the_stage(tmp_path: Path) -> None:
         killer.join()
     assert not outcome.done and outcome.not_run == ["b"] and not outcome.stopped
     assert "max_worker_restarts" in outcome.failed["a"] and "SIGKILL" in outcome.failed["a"]
-    assert not multiprocessing.active_children()
+    assert not children()
 
 
 def _kill_workers(stop: threading.Event) -> None:
     while not stop.wait(0.05):
-        for child in multiprocessing.active_children():
-            if child.name.startswith("rollout-worker-") and child.pid is not None:
-                os.kill(child.pid, signal.SIGKILL)
+        for child in children():
+            with suppress(psutil.NoSuchProcess):
+                if child.name().startswith("rollout-worker-"):
+                    child.kill()
 
 
 @pytest.mark.parametrize("distributed", [False, True])
 def test_nothing_is_left_when_the_orchestrator_is_killed(tmp_path: Path, distributed: bool) -> None:
     run = fake_run(tmp_path)
     code = f"""
+from contextlib import suppress
 from pathlib import Path
 from tests.fakes import FakeStage, fake_run
 from oodil.workers.local_engine import LocalEngine
@@ -262,7 +257,7 @@ def test_an_exception_in_the_orchestrator_ends_everything_at_once(tmp_path: Path
 
     with pytest.raises(KeyboardInterrupt):
         LocalEngine(2).run_jobs(FakeStage(True), run, ["waits"], lambda event: None, interrupt)
-    assert not multiprocessing.active_children()
+    assert not children()
     assert not endpoint_folder(tmp_path).exists()
     (pid,) = lines(tmp_path / "waits.attempts")
     assert not is_alive(int(pid))

@@ -1,6 +1,5 @@
 """Jobs with real processes and sockets: the same files whatever the engine, and nothing left behind."""
 
-import multiprocessing
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +12,7 @@ from oodil.workers.channels import endpoint_folder
 from oodil.workers.engine import Outcome
 from oodil.workers.local_engine import LocalEngine
 from oodil.workers.reports import DONE, Event, Finished, Progress, Started
-from tests.fakes import FakeStage, failures, fake_run, lines
+from tests.fakes import FakeStage, children, failures, fake_run, lines
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -23,7 +22,7 @@ def run_jobs(run: Run, workers: int, jobs: list[str], distributed: bool = False)
     events: list[Event] = []
     engine = LocalEngine(workers)
     outcome = engine.run_jobs(FakeStage(distributed), run, jobs, events.append, lambda: False)
-    assert not multiprocessing.active_children()
+    assert not children()
     assert not endpoint_folder(run.directory.path).exists()
     return outcome, events
 

@@ -128,7 +128,7 @@ def test_one_file_knows_zeromq():
 
 
 def test_one_file_starts_processes():
-    assert [name for name in sources() if starts_processes(parse(name))] == ["workers/supervisor.py"]
+    assert [name for name in sources() if starts_processes(parse(name))] == ["workers/fork_server.py"]
 
 
 @pytest.mark.parametrize("name", sources())
