@@ -1,10 +1,10 @@
-# make install | quickstart | test | docs: each prepares what it needs and can be repeated.
+# make install | quickstart | unit | test | docs: each prepares what it needs and can be repeated.
 PYTHON ?= python3
 PIP_ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install quickstart smoke test check docs clean
+.PHONY: install quickstart smoke unit test check docs clean
 install: $(VENV)/installed
 
 $(VENV)/installed: pyproject.toml constraints.txt
@@ -28,6 +28,9 @@ check: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+unit: install
+	$(BIN)/python -m pytest -n 2 -m "not slow and not ray" tests/unit tests/property
 
 test: check
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder

@@ -21,7 +21,8 @@ from oodil.pipeline.stage import Run, Stage, state_of
 from oodil.pipeline.stages import stages
 from oodil.pipeline.stages.demonstrations import check_demonstrations
 from oodil.pipeline.versions import library_versions
-from oodil.workers.engine import Engine, Event, Outcome
+from oodil.workers.engine import Engine, Outcome
+from oodil.workers.reports import Event
 
 
 class Observer:
@@ -146,7 +147,7 @@ def execute(
     should_stop: Callable[[], bool] = lambda: False,
     force: Collection[str] = (),
 ) -> None:
-    """Bring every chosen stage to its finished artifact; those in ``force`` are computed again.
+    """Bring every chosen stage to its finished artifact; finished ones in ``force`` are computed again.
 
     Raises UnfinishedError where that ends early, and ConfigError if another process works on the run.
     """
@@ -154,14 +155,21 @@ def execute(
     with _lock(run.directory):
         _record(run.directory, "run_started", engine=str(engine), versions=library_versions())
         for stage in chosen:
-            _execute_stage(stage, run, engine, observer, should_stop, stage.name in force)
+            _execute_stage(stage, run, engine, observer, should_stop, force)
         _record(run.directory, "run_finished")
 
 
 def _execute_stage(
-    stage: Stage, run: Run, engine: Engine, observer: Observer, should_stop: Callable[[], bool], forced: bool
+    stage: Stage,
+    run: Run,
+    engine: Engine,
+    observer: Observer,
+    should_stop: Callable[[], bool],
+    force: Collection[str],
 ) -> None:
     state = state_of(stage, run)
+    # Of a stale stage, only the jobs that differ are computed again.
+    forced = state.state == "done" and stage.name in force
     if state.state == "done" and not forced:
         observer.stage_reused(stage.name)
         return

@@ -50,7 +50,7 @@ from oodil.pipeline.training import experience
 from oodil.pipeline.versions import library_versions
 from oodil.workers import rollout_worker as rollout_process
 from oodil.workers.channels import private_endpoint
-from oodil.workers.supervisor import Restarts, Supervisor
+from oodil.workers.supervisor import Supervisor
 from oodil.workers.zmq_rollouts import ZmqRollouts
 
 PARTS = ("stepping", "learner", "scaling")
@@ -218,7 +218,7 @@ def rollout_rate(env_id: str, workers: int) -> float:
         with Supervisor(Path(folder), "scaling") as supervisor:
             for index in range(workers):
                 shared = {"endpoint": endpoint, "run_id": "scaling"}
-                supervisor.start(f"worker-{index}", rollout_process.main, shared, Restarts(0, 0.0))
+                supervisor.start(f"worker-{index}", rollout_process.main, shared)
             supervisor.poll(0.0)
             experience(policy, environment, config, SCALING_STEPS // 4, 0, context)  # processes start
             started = time.perf_counter()

@@ -152,19 +152,10 @@ class RunResults:
         ``auroc`` of the scores, and the former's share of the sampling mass: ``share_before`` weighting, ``share`` with
         the weights and ``share_unsharpened`` with the scores as weights. Empty without marks of both kinds.
         """
-        marks = self.marks()
+        marks, found = self.marks(), self.weighting(weighting)
         if marks is None or not 0 < marks.sum() < len(marks):
             return {}
-        from sklearn.metrics import roc_auc_score
-
-        found, demonstrations = self.weighting(weighting), self.demonstrations
-        weights = {
-            "share_before": np.ones(len(demonstrations)),
-            "share_unsharpened": sharpened_weights(found.scores, 1.0),
-            "share": found.weights,
-        }
-        shares = {name: float(sampling_mass(w, demonstrations)[marks].sum()) for name, w in weights.items()}
-        return {"auroc": float(roc_auc_score(marks, found.scores)), **shares}
+        return separation_metrics(marks, found.scores, found.weights, self.demonstrations)
 
     def env_steps(self) -> dict[str, int]:
         """Return the environment steps that each finished stage took; stages that take none are left out."""
@@ -249,6 +240,21 @@ class RunResults:
             "stages": described,
             "results": self.summary(),
         }
+
+
+def separation_metrics(
+    marks: NDArray[np.bool_], scores: NDArray[np.float64], weights: NDArray[np.float64], demonstrations: Demonstrations
+) -> dict[str, float]:
+    """Return what `RunResults.separation` does for (N,) marks of both kinds, scores and weights."""
+    from sklearn.metrics import roc_auc_score
+
+    by_share = {
+        "share_before": np.ones(len(demonstrations)),
+        "share_unsharpened": sharpened_weights(scores, 1.0),
+        "share": weights,
+    }
+    shares = {name: float(sampling_mass(w, demonstrations)[marks].sum()) for name, w in by_share.items()}
+    return {"auroc": float(roc_auc_score(marks, scores)), **shares}
 
 
 def shown_return(value: float) -> str:

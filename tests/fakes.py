@@ -16,9 +16,9 @@ from oodil.pipeline.data import Unit, UnitResult
 from oodil.pipeline.loading import parse_config
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.seeding import derive_key
-from oodil.pipeline.stage import JobContext, JobStoppedError, Run, Stage
+from oodil.pipeline.stage import JobContext, JobStoppedError, Run, Stage, register
+from oodil.workers.reports import AttemptFailed, Event
 
-STAGES = "tests.fakes:stage_named"
 NUM_GROUPS = 4
 
 
@@ -75,9 +75,9 @@ def chain(rollouts: RolloutSource, iterations: int) -> list[UnitResult]:
 class FakeStage(Stage):
     """Each iteration it collects and adds up; a job's name says what else happens to it.
 
-    ``raises`` raises in every attempt from its second iteration on, ``killed`` kills its own process once, in the
-    middle, ``frozen`` stops its own process once, ``hangs`` sleeps for an hour once, and ``waits`` does not end before
-    the file ``go`` is in the run directory.
+    ``raises`` raises in every attempt after its second iteration, ``raises_often`` after each iteration, ``killed``
+    kills its own process once, in the middle, ``killed_often`` after each iteration, ``frozen`` stops its own process
+    once, ``hangs`` sleeps for an hour once, and ``waits`` does not end before the file ``go`` is in the run directory.
     """
 
     version = 1
@@ -100,6 +100,8 @@ class FakeStage(Stage):
         iteration, total = (int(arrays["iteration"]), arrays["total"]) if arrays else (0, np.zeros((2, 12)))
         note(folder / f"{job}.began_at", str(iteration))
         while iteration < self.num_iterations:
+            if job == "raises" and iteration == 2:
+                raise ArithmeticError(f"told to, in attempt {len(lines(folder / 'raises.attempts'))}")
             context.rollouts.submit(hopper_units(iteration))
             results = context.rollouts.gather()
             for group, result in enumerate(results):
@@ -110,8 +112,10 @@ class FakeStage(Stage):
             # Noted once the checkpoint is safe, so that a test that waits for the note knows where a resume begins.
             note(folder / f"{job}.iterations", str(iteration))
             context.progress(iteration, self.num_iterations, reward=float(total.mean()))
-            if job == "raises" and iteration >= 2:
-                raise ArithmeticError(f"told to, in attempt {len(lines(folder / 'raises.attempts'))}")
+            if job == "raises_often":
+                raise ArithmeticError("told to, after each iteration")
+            if job == "killed_often":
+                os.kill(os.getpid(), signal.SIGKILL)
             first = len(lines(folder / f"{job}.attempts")) == 1
             if job in ("killed", "frozen") and iteration == 3 and first:
                 os.kill(os.getpid(), signal.SIGKILL if job == "killed" else signal.SIGSTOP)
@@ -124,9 +128,8 @@ class FakeStage(Stage):
         return {"total.safetensors": encode_arrays({"total": total})}
 
 
-def stage_named(config: RunConfig, name: str) -> Stage:
-    """Return one of the two fake stages."""
-    return FakeStage(distributed=name == "learner")
+register(FakeStage(distributed=False))
+register(FakeStage(distributed=True))
 
 
 def fake_run(path: Path, **runtime: Any) -> Run:
@@ -147,6 +150,15 @@ def fake_run(path: Path, **runtime: Any) -> Run:
     path.mkdir(parents=True, exist_ok=True)
     directory.config.write_text(config.model_dump_json())
     return Run(config, directory)
+
+
+def failures(events: list[Event]) -> list[tuple[str, int, bool]]:
+    """Return (job, attempt, whether there is another) of every attempt that failed."""
+    return [
+        (event.name, event.report.attempt, event.report.will_retry)
+        for event in events
+        if isinstance(event.report, AttemptFailed)
+    ]
 
 
 def note(path: Path, line: str) -> None:

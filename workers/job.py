@@ -1,111 +1,107 @@
-"""The process of a job, a learner's included: find the stage, run the job, write its artifact."""
+"""A job, a learner's included, wherever it runs: what it sees of the runtime, and how its artifact is written."""
 
-import importlib
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from oodil.pipeline.artifacts import RunDirectory, write_artifact
+from oodil.pipeline.collecting import InlineRollouts, RolloutSource
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.stage import JobStoppedError, Run, Stage, stage_named
+from oodil.pipeline.versions import library_versions
 from oodil.workers.channels import Access
-from oodil.workers.reports import Progress, Report, Silent, Warn
+from oodil.workers.reports import DONE, STOPPED, Progress, Report, Silent, Warn
 from oodil.workers.supervisor import Link
 from oodil.workers.wire import shortened
 
-if TYPE_CHECKING:
-    # A job's process says that it runs before it loads what it computes with.
-    from oodil.pipeline.stage import JobContext, Run, Stage
-from oodil.pipeline.collecting import RolloutSource
-
-DONE, STOPPED = "done", "stopped"
 _REPORT_INTERVAL_S = 0.2
+"""Progress is not reported more often than anybody can read."""
 
 
 class Context:
-    """A job's view of where it runs: ``send`` takes its reports to the orchestrator."""
+    """A job's view of where it runs, the same for every engine: ``send`` takes its reports to the engine."""
 
     def __init__(
         self,
+        rollouts: RolloutSource,
+        checkpoint_interval_s: float,
         send: Callable[[Report], None],
         should_stop: Callable[[], bool],
-        rollouts: "RolloutSource",
-        checkpoint_interval_s: float,
     ) -> None:
-        self.should_stop = should_stop
         self.rollouts = rollouts
         self.checkpoint_interval_s = checkpoint_interval_s
+        self.should_stop = should_stop
         self._send = send
         self._next_report = 0.0
 
     def progress(self, done: int, total: int, **metrics: float) -> None:
-        """Report progress, but not more often than anybody can read."""
+        """Report ``done`` of ``total`` environment steps (or iterations) and current figures; cheap to call often."""
+        figures = {name: float(value) for name, value in metrics.items()}
         now = time.monotonic()
         if now >= self._next_report or done >= total:
             self._next_report = now + _REPORT_INTERVAL_S
-            figures = {name: float(value) for name, value in metrics.items()}
             self._send(Progress(int(done), int(total), figures))
 
     def warn(self, message: str) -> None:
-        """Pass a warning on."""
+        """Say something the user should see."""
         self._send(Warn(shortened(message)))
+
+
+def run_job(
+    stage: Stage,
+    run: Run,
+    job: str,
+    rollouts: RolloutSource,
+    send: Callable[[Report], None],
+    should_stop: Callable[[], bool],
+) -> str:
+    """Run a job in this process and write its artifact; its checkpoints go when that is safe on disk.
+
+    Returns DONE, or STOPPED when it stopped because ``should_stop`` returned true. Raises what the job raises.
+    """
+    context = Context(rollouts, run.config.runtime.checkpoint_interval_s, send, should_stop)
+    try:
+        files = stage.run_job(run, job, context)
+    except JobStoppedError:
+        return STOPPED
+    write_artifact(run.directory.job(stage.name, job), stage.job_origin(run, job), files, library_versions())
+    stage.checkpoints(run, job).clear()
+    return DONE
+
+
+def open_stage(run_path: str, name: str, module: str) -> tuple[Stage, Run]:
+    """Return a stage, which importing ``module`` registers, and the run in a folder."""
+    directory = RunDirectory(Path(run_path))
+    config = RunConfig.model_validate_json(directory.config.read_text())
+    return stage_named(name, module), Run(config, directory)
 
 
 def main(
     link: Link,
     run_path: str,
-    stages: str,
     stage: str,
+    module: str,
     job: str,
     endpoint: str = "",
     run_id: str = "",
     address: str = "",
     keys: str = "",
 ) -> str:
-    """Run one job; rollout workers collect for it if there is an endpoint, those of other machines at the address.
+    """Run one job in a process of its own and return its outcome.
 
-    Returns DONE or STOPPED.
+    Rollout workers collect for it if there is an endpoint, those of other machines at the address.
     """
-    from oodil.pipeline.stage import JobStoppedError
-
-    found, run = find(run_path, stages, stage)
-    runtime = run.config.runtime
+    found, run = open_stage(run_path, stage, module)
     access = Access(address, Path(keys)) if address else None
-    with _rollouts(link, endpoint, run_id, runtime.unit_timeout_s, access) as rollouts:
-        context = Context(link.send, link.should_stop, rollouts, runtime.checkpoint_interval_s)
-        try:
-            execute(found, run, job, context)
-        except JobStoppedError:
-            return STOPPED
-    return DONE
-
-
-def find(run_path: str, stages: str, name: str) -> "tuple[Stage, Run]":
-    """Return a stage of the run in a folder; ``stages`` is module:function for ``(config, name) -> Stage``."""
-    from oodil.pipeline.artifacts import RunDirectory
-    from oodil.pipeline.config import RunConfig
-    from oodil.pipeline.stage import Run
-
-    directory = RunDirectory(Path(run_path))
-    config = RunConfig.model_validate_json(directory.config.read_text())
-    module, _, function = stages.partition(":")
-    return getattr(importlib.import_module(module), function)(config, name), Run(config, directory)
-
-
-def execute(stage: "Stage", run: "Run", job: str, context: "JobContext") -> None:
-    """Run a job in this process and write its artifact; its checkpoints go when that is safe on disk."""
-    from oodil.pipeline.artifacts import write_artifact
-    from oodil.pipeline.versions import library_versions
-
-    files = stage.run_job(run, job, context)
-    write_artifact(run.directory.job(stage.name, job), stage.job_origin(run, job), files, library_versions())
-    stage.checkpoints(run, job).clear()
+    with _rollouts(link, endpoint, run_id, run.config.runtime.unit_timeout_s, access) as rollouts:
+        return run_job(found, run, job, rollouts, link.send, link.should_stop)
 
 
 @contextmanager
 def _rollouts(
     link: Link, endpoint: str, run_id: str, unit_timeout_s: float, access: Access | None
-) -> "Iterator[RolloutSource]":
-    from oodil.pipeline.collecting import InlineRollouts
+) -> Iterator[RolloutSource]:
     from oodil.workers.zmq_rollouts import ZmqRollouts
 
     if not endpoint:

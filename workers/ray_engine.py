@@ -11,7 +11,6 @@ import ipaddress
 import os
 import time
 import traceback
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,16 +23,15 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from oodil.pipeline.collecting import Follow, InlineRollouts, collect, nothing_follows
 from oodil.pipeline.data import Unit, UnitResult
 from oodil.pipeline.errors import ConfigError
-from oodil.pipeline.stage import JobStoppedError, Run, Stage
+from oodil.pipeline.stage import Run, Stage
 from oodil.pipeline.versions import collecting_versions
 from oodil.workers import job as job_process
-from oodil.workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, JobWarning, OnEvent, Outcome
+from oodil.workers.engine import POLL_S, JobLedger, OnEvent, Outcome, ShouldStop
 from oodil.workers.messages import Header, ResultMessage, UnitMessage, decode, encode
-from oodil.workers.reports import Failed, Progress, Report, Warn, decode_report, encode_report
+from oodil.workers.reports import STOPPED, Failed, Finished, Report, decode_report, encode_report
 from oodil.workers.wire import MessageError, shortened
 
-_POLL_S = 0.2
-_LOST = "its process or its node is gone; Ray runs it again"
+_LOST = "its process or its node is gone"
 _HEADER = Header("", "", "ray", 0)
 """Ray knows which answer belongs to which question."""
 _ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
@@ -77,119 +75,83 @@ def _refuse_unless(acceptable: bool) -> None:
 class RayEngine:
     """Runs jobs as Ray tasks; a distributed stage's job has its units collected by Ray tasks, too."""
 
-    def __init__(self, stages: str = "oodil.pipeline.stages:stage_named") -> None:
-        self._stages = stages
-        """Where a task finds ``(config, name) -> Stage``, as module:function."""
-
     def __str__(self) -> str:
         return "ray"
 
-    def run_jobs(
-        self, stage: Stage, run: Run, jobs: list[str], on_event: OnEvent, should_stop: Callable[[], bool]
-    ) -> Outcome:
+    def run_jobs(self, stage: Stage, run: Run, jobs: list[str], on_event: OnEvent, should_stop: ShouldStop) -> Outcome:
         """Run jobs until each is done or has failed; see `Engine`.
 
         Raises ConfigError when a node does not see the run's folder or has other libraries.
         """
         path = str(run.directory.path.absolute())
         _check_nodes(path)
-        runtime = run.config.runtime
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
         board: Any = ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here).remote()
-        task = ray.remote(_run_job).options(max_retries=runtime.max_attempts - 1, retry_exceptions=True)
-        running = {task.remote(board, path, self._stages, stage.name, job): job for job in jobs}
-        reader = _Reader(runtime.max_attempts, on_event)
-        outcome = Outcome()
+        # Ray tries nothing again by itself: the ledger knows which attempts got further.
+        task = ray.remote(_run_job).options(max_retries=0)
+        ledger = JobLedger(jobs, run.config.runtime, on_event)
+        due = dict.fromkeys(jobs, 0.0)
+        running: dict[Any, str] = {}
         try:
-            while running:
-                if should_stop() and not outcome.stopped:
-                    outcome.stopped = True
+            while running or (due and not ledger.stopped):
+                if not ledger.stopped and should_stop():
+                    ledger.stopped = True
                     ray.get(board.stop.remote())
-                ended, _ = ray.wait(list(running), timeout=_POLL_S)
-                reader.take_in(ray.get(board.read.remote()))
+                for job in [job for job, at in due.items() if at <= time.monotonic() and not ledger.stopped]:
+                    del due[job]
+                    ledger.begin(job)
+                    running[task.remote(board, path, stage.name, stage.module, job)] = job
+                ended = _wait(list(running))
+                for job, content in ray.get(board.read.remote()):
+                    ledger.report(job, decode_report(content))
                 for reference in ended:
-                    self._take_out(running.pop(reference), reference, reader, outcome)
+                    job, words = running.pop(reference), _last_words(reference)
+                    if isinstance(words, Finished):
+                        ledger.finished(job, words.outcome)
+                        continue
+                    delay_s = ledger.failed(job, words.reason)
+                    if delay_s is not None:
+                        due[job] = time.monotonic() + delay_s
         finally:
             for reference in running:
                 ray.cancel(reference, force=True)
             ray.kill(board)
-        outcome.done.sort(key=jobs.index)
-        return outcome
-
-    def _take_out(self, job: str, reference: Any, reader: "_Reader", outcome: Outcome) -> None:
-        try:
-            ended = ray.get(reference)
-        except ray.exceptions.RayError as error:
-            outcome.failed[job] = reader.first_reason(job) or str(error)
-            reader.lost_for_good(job)
-        else:
-            if ended == job_process.DONE:
-                outcome.done.append(job)
-                reader.done(job)
-            else:
-                outcome.not_run.append(job)
+        return ledger.outcome()
 
 
-class _Reader:
-    """Turns what jobs wrote on the board into the engine's events."""
+def _wait(running: list[Any]) -> list[Any]:
+    """Wait for a while; return the tasks that have ended."""
+    if not running:
+        time.sleep(POLL_S)
+        return []
+    return list(ray.wait(running, timeout=POLL_S)[0])
 
-    def __init__(self, max_attempts: int, on_event: OnEvent) -> None:
-        self._max_attempts = max_attempts
-        self._on_event = on_event
-        self._attempts: Counter[str] = Counter()
-        self._failures: Counter[str] = Counter()
-        self._first_reason: dict[str, str] = {}
 
-    def take_in(self, notes: list[tuple[str, bytes]]) -> None:
-        for job, content in notes:
-            for event in self._events(job, decode_report(content) if content else None):
-                self._on_event(event)
-
-    def first_reason(self, job: str) -> str:
-        return self._first_reason.get(job, "")
-
-    def lost_for_good(self, job: str) -> None:
-        """The last attempt is over; say so unless it did itself."""
-        if self._failures[job] < self._attempts[job]:
-            self._on_event(self._failed(job, _LOST))
-
-    def done(self, job: str) -> None:
-        self._on_event(JobDone(job))
-
-    def _events(self, job: str, report: Report | None) -> list[Event]:
-        if report is None:
-            gone = [self._failed(job, _LOST)] if self._failures[job] < self._attempts[job] else []
-            self._attempts[job] += 1
-            return [*gone, JobStarted(job, self._attempts[job])]
-        if isinstance(report, Progress):
-            return [JobProgress(job, report.done, report.total, report.metrics)]
-        if isinstance(report, Warn):
-            return [JobWarning(job, report.text)]
-        if isinstance(report, Failed):
-            return [self._failed(job, report.traceback)]
-        raise MessageError(f"a job says nothing like {type(report).__name__}")
-
-    def _failed(self, job: str, reason: str) -> JobFailed:
-        self._failures[job] = self._attempts[job]
-        self._first_reason.setdefault(job, reason)
-        return JobFailed(job, self._attempts[job], self._attempts[job] < self._max_attempts, reason)
+def _last_words(reference: Any) -> Finished | Failed:
+    """Return what a task that has ended returned, or how it was lost."""
+    try:
+        words = decode_report(ray.get(reference))
+    except ray.exceptions.RayError as error:
+        return Failed(f"{error}\n{_LOST}")
+    assert isinstance(words, Finished | Failed)
+    return words
 
 
 class _Board:
     """An actor beside the orchestrator: what jobs say until it is read, and whether they should stop."""
 
     def __init__(self) -> None:
-        self._notes: list[tuple[str, bytes]] = []
+        self._reports: list[tuple[str, bytes]] = []
         self._is_stopping = False
 
     def write(self, job: str, report: bytes) -> None:
-        """Note a job's report; an empty one says that an attempt begins."""
-        self._notes.append((job, report))
+        """Keep a job's report."""
+        self._reports.append((job, report))
 
     def read(self) -> list[tuple[str, bytes]]:
         """Return what was written since the last time."""
-        notes, self._notes = self._notes, []
-        return notes
+        reports, self._reports = self._reports, []
+        return reports
 
     def stop(self) -> None:
         """Ask all jobs to stop."""
@@ -203,63 +165,54 @@ class _Board:
 class _Writer:
     """A job's end of the board."""
 
-    def __init__(self, board: Any, job: str, set_back: Callable[[], None]) -> None:
+    def __init__(self, board: Any, job: str, reset_timer: Callable[[], None]) -> None:
         self._board = board
         self._job = job
-        self._set_back = set_back
+        self._reset_timer = reset_timer
         self._next_question = 0.0
         self._is_stopping = False
 
-    def begin(self) -> None:
-        """Note that an attempt begins."""
-        ray.get(self._board.write.remote(self._job, b""))
-
     def send(self, report: Report) -> None:
-        """Put a report on the board; the clock that ends a hanging task begins again."""
-        self._set_back()
+        """Put a report on the board; the time allowed without any begins again."""
+        self._reset_timer()
         ray.get(self._board.write.remote(self._job, encode_report(report)))
 
     def should_stop(self) -> bool:
         """Return whether the orchestrator asked for an end; it is asked now and then."""
         if not self._is_stopping and time.monotonic() >= self._next_question:
-            self._next_question = time.monotonic() + _POLL_S
+            self._next_question = time.monotonic() + POLL_S
             self._is_stopping = ray.get(self._board.is_stopping.remote())
         return self._is_stopping
 
 
 @contextmanager
 def _ended_after(timeout_s: float) -> Iterator[Callable[[], None]]:
-    """End this process after a time, by a thread that no simulator can hold up; what is yielded sets the clock back."""
+    """End this process after a time, by a thread that no simulator can hold up; what is yielded starts it anew."""
 
-    def set_back() -> None:
+    def reset_timer() -> None:
         faulthandler.dump_traceback_later(timeout_s, exit=True)
 
-    set_back()
+    reset_timer()
     try:
-        yield set_back
+        yield reset_timer
     finally:
         faulthandler.cancel_dump_traceback_later()
 
 
-def _run_job(board: Any, run_path: str, stages: str, stage_name: str, job: str) -> str:
-    """The task of a job; returns DONE or STOPPED."""
-    stage, run = job_process.find(run_path, stages, stage_name)
+def _run_job(board: Any, run_path: str, stage_name: str, module: str, job: str) -> bytes:
+    """The task of a job; returns its last report."""
+    stage, run = job_process.open_stage(run_path, stage_name, module)
     runtime = run.config.runtime
     rollouts = RayRollouts(runtime.unit_timeout_s) if stage.distributed else InlineRollouts()
-    with _ended_after(runtime.job_timeout_s) as set_back:
-        writer = _Writer(board, job, set_back)
-        context = job_process.Context(writer.send, writer.should_stop, rollouts, runtime.checkpoint_interval_s)
+    with _ended_after(runtime.job_timeout_s) as reset_timer:
+        writer = _Writer(board, job, reset_timer)
         if writer.should_stop():
-            return job_process.STOPPED
-        writer.begin()
+            return encode_report(Finished(STOPPED))
         try:
-            job_process.execute(stage, run, job, context)
-        except JobStoppedError:
-            return job_process.STOPPED
+            outcome = job_process.run_job(stage, run, job, rollouts, writer.send, writer.should_stop)
         except Exception:
-            writer.send(Failed(shortened(traceback.format_exc())))
-            raise
-        return job_process.DONE
+            return encode_report(Failed(shortened(traceback.format_exc())))
+        return encode_report(Finished(outcome))
 
 
 class RayRollouts:

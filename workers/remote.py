@@ -6,11 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from oodil.pipeline.errors import OodilError
-from oodil.workers import rollout_worker as rollout_process
-from oodil.workers.supervisor import Died, Ended, Restarts, Started, Supervisor
+from oodil.workers import rollout_worker
+from oodil.workers.engine import Attempts
+from oodil.workers.reports import Failed, Finished, Started
+from oodil.workers.supervisor import Supervisor
 
 _POLL_S = 0.2
-_RESTARTS, _DELAY_S = 1_000_000, 1.0
+_ATTEMPTS, _DELAY_S = 1_000_000, 1.0
 
 
 class WorkersError(OodilError):
@@ -28,13 +30,17 @@ def serve(
     host = f"{socket.gethostname()}-{os.getpid()}-"
     arguments = {"endpoint": address, "host": host, "keys": str(keys)}
     with Supervisor(logs, "remote") as supervisor:
-        for index in range(workers):
-            supervisor.start(f"worker-{index}", rollout_process.main, arguments, Restarts(_RESTARTS, _DELAY_S))
+        attempts = {f"worker-{index}": Attempts(_ATTEMPTS, _DELAY_S) for index in range(workers)}
+        for name in attempts:
+            supervisor.start(name, rollout_worker.main, arguments)
         while not should_stop():
             for event in supervisor.poll(_POLL_S):
-                if isinstance(event, Started):
-                    say(f"{host}{event.name}: collects for {address}")
-                elif isinstance(event, Ended):
-                    raise WorkersError(event.outcome)
-                elif isinstance(event, Died):
-                    say(f"{host}{event.name}: {event.reason}; started again")
+                match event.report:
+                    case Started(_):
+                        say(f"{host}{event.name}: collects for {address}")
+                    case Finished(outcome):
+                        raise WorkersError(outcome)
+                    case Failed(reason):
+                        say(f"{host}{event.name}: {reason}; started again")
+                        delay_s = attempts[event.name].failed(reason)
+                        supervisor.start(event.name, rollout_worker.main, arguments, delay_s or 0.0)

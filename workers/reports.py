@@ -1,8 +1,16 @@
-"""What a child process says to its parent, and the one thing that a parent says: each report is one msgpack value."""
+"""What is said about jobs and rollout workers.
+
+Reports travel between a child process and its parent, each as one msgpack value. An `Event` says whom a report is
+about; whoever watches a run gets events whose reports are those of the job itself, passed on as they are, and those
+that only an engine can make.
+"""
 
 from dataclasses import dataclass
 
 from oodil.workers.wire import MessageError, Readers, brief, count, items, numbers_by_name, pack, read, text, unpack
+
+DONE, STOPPED = "done", "stopped"
+"""Outcomes of a job: its artifact is written; it wrote a checkpoint and stopped because it was asked to."""
 
 
 # parent -> child
@@ -40,7 +48,7 @@ class Silent:
 # child -> parent, its last words
 @dataclass(frozen=True)
 class Finished:
-    """The child did what it was started for; ``outcome`` is what its main function returned."""
+    """It did what it was started for; ``outcome`` is DONE or STOPPED for a job."""
 
     outcome: str
 
@@ -48,12 +56,49 @@ class Finished:
 # child -> parent, its last words
 @dataclass(frozen=True)
 class Failed:
-    """The child's main function raised."""
+    """It raised, or it died, which its parent finds out; ``reason`` is its traceback if there is one."""
 
-    traceback: str
+    reason: str
 
 
 Report = Stop | Progress | Warn | Silent | Finished | Failed
+
+
+# made by a supervisor or an engine
+@dataclass(frozen=True)
+class Started:
+    """An attempt begins; the first is 1."""
+
+    attempt: int
+
+
+# made by an engine
+@dataclass(frozen=True)
+class AttemptFailed:
+    """An attempt at a job raised or was killed."""
+
+    attempt: int
+    reason: str
+    """Its traceback if there is one."""
+    will_retry: bool
+
+
+# made by an engine
+@dataclass(frozen=True)
+class Replaced:
+    """A rollout worker died and another one is started in its place."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Event:
+    """A report and whom it is about."""
+
+    name: str
+    """Of a job or of a rollout worker."""
+    report: Report | Started | AttemptFailed | Replaced
+
 
 _REPORTS: dict[type[Report], Readers] = {
     Stop: {},
@@ -61,7 +106,7 @@ _REPORTS: dict[type[Report], Readers] = {
     Warn: {"text": text},
     Silent: {"worker": text},
     Finished: {"outcome": text},
-    Failed: {"traceback": text},
+    Failed: {"reason": text},
 }
 
 

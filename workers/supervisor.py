@@ -1,8 +1,8 @@
-"""Child processes: starting, watching, restarting and ending them; the only file that starts any.
+"""Child processes: starting, watching and ending them; the only file that starts any.
 
 Parent and child share a pipe that carries encoded reports and nothing else. The child watches its end: when the parent
-is gone, however it died, the pipe closes and the child ends at once. Whether and when something is started again is
-decided here and nowhere else.
+is gone, however it died, the pipe closes and the child ends at once. Whether something is started again is for the
+caller to decide (`oodil.workers.engine.Attempts`).
 """
 
 import faulthandler
@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -23,10 +24,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from oodil.workers.reports import Failed, Finished, Report, Stop, decode_report, encode_report
+from oodil.workers.reports import Event, Failed, Finished, Report, Started, Stop, decode_report, encode_report
 from oodil.workers.wire import MessageError, shortened
 
-MAX_DELAY_S = 10.0
 _MAX_REPORT_BYTES = 1024 * 1024
 _TERMINATE_S = 2.0
 """How long a child may take to follow SIGTERM before it is killed."""
@@ -38,62 +38,6 @@ _context = multiprocessing.get_context("spawn")
 Pipe = connection.Connection
 Main = Callable[..., str]
 """A child's main function: called with its Link and plain keyword arguments; returns its outcome."""
-
-
-class Restarts:
-    """How often something may still be started again, and after what pause; the pause doubles each time."""
-
-    def __init__(self, limit: int, delay_s: float) -> None:
-        self._left = limit
-        self._delay_s = delay_s
-
-    def next_delay(self) -> float | None:
-        """Use one restart and return the pause before it, or None when none is left."""
-        if self._left == 0:
-            return None
-        self._left -= 1
-        delay = min(self._delay_s, MAX_DELAY_S)
-        self._delay_s *= 2
-        return delay
-
-
-@dataclass(frozen=True)
-class Started:
-    """A child was started, for the first time or again."""
-
-    name: str
-    attempt: int
-
-
-@dataclass(frozen=True)
-class Said:
-    """A child sent a report."""
-
-    name: str
-    report: Report
-
-
-@dataclass(frozen=True)
-class Ended:
-    """A child did what it was started for."""
-
-    name: str
-    outcome: str
-
-
-@dataclass(frozen=True)
-class Died:
-    """A child ended in any other way."""
-
-    name: str
-    attempt: int
-    reason: str
-    """Its traceback if there is one."""
-    restarts: bool
-    """Whether it will be started again."""
-
-
-Event = Started | Said | Ended | Died
 
 
 @dataclass
@@ -117,17 +61,15 @@ class _Process:
 
 @dataclass
 class _Child:
-    """What should be running, through all its restarts."""
+    """What runs, or is about to."""
 
     name: str
+    attempt: int
     main: Main
     arguments: dict[str, str]
-    restarts: Restarts
-    attempt: int = 0
-    due: float = 0.0
+    due: float
     """When to start it, on the monotonic clock, while it is not running."""
     running: _Process | None = None
-    is_stopping: bool = False
 
 
 class Supervisor:
@@ -137,6 +79,7 @@ class Supervisor:
         self._logs = logs
         self._prefix = prefix
         self._children: dict[str, _Child] = {}
+        self._attempts: Counter[str] = Counter()
 
     def __enter__(self) -> Self:
         return self
@@ -147,35 +90,41 @@ class Supervisor:
         # An exception here is a second Ctrl-C or a defect: nobody wants to wait.
         self.close(_GRACE_S if error is None else 0.0)
 
-    def start(self, name: str, main: Main, arguments: dict[str, str], restarts: Restarts) -> None:
-        """Let a child run; the next `poll` starts it. Its log is ``<prefix>-<name>.<attempt>.log``."""
+    def start(self, name: str, main: Main, arguments: dict[str, str], delay_s: float = 0.0) -> None:
+        """Let a child run; a `poll` starts it once the delay is over. Its log is ``<prefix>-<name>.<attempt>.log``.
+
+        Starts of one name are counted as its attempts, from 1. Raises ValueError while a child of that name is there.
+        """
         if name in self._children:
             raise ValueError(f"a child named {name!r} is already there")
-        self._children[name] = _Child(name, main, arguments, restarts)
+        self._attempts[name] += 1
+        self._children[name] = _Child(name, self._attempts[name], main, arguments, time.monotonic() + delay_s)
 
     def poll(self, timeout_s: float) -> list[Event]:
-        """Start what is due, wait until something happens or the deadline, and return what happened, in order."""
+        """Start what is due, wait until something happens or the deadline, and return what happened, in order.
+
+        The last event of a child is `Finished` or `Failed`; then it is not there any more.
+        """
         events: list[Event] = []
         waiting = [child for child in self._children.values() if child.running is None]
         for child in waiting:
             if child.due <= time.monotonic():
                 self._launch(child)
-                events.append(Started(child.name, child.attempt))
+                events.append(Event(child.name, Started(child.attempt)))
             else:
                 timeout_s = min(timeout_s, child.due - time.monotonic())
         self._wait(0.0 if events else max(timeout_s, 0.0))
         for child, running in self._running():
             # Asked in this order, everything that a dead child said has arrived.
             is_dead = not running.process.is_alive()
-            events += [Said(child.name, report) for report in _heard(running)]
+            events += [Event(child.name, report) for report in _received(running)]
             if is_dead:
-                events.append(self._bury(child, running))
+                events.append(Event(child.name, self._ended(child, running)))
         return events
 
     def stop(self, name: str) -> bool:
-        """Ask a child to end and never start it again; return whether it runs, so that its end is still to come."""
+        """Ask a child to end; return whether it runs, so that its end is still to come. One not yet due is dropped."""
         child = self._children[name]
-        child.is_stopping = True
         if child.running is None:
             del self._children[name]
             return False
@@ -212,7 +161,6 @@ class Supervisor:
         connection.wait(handles, timeout_s) if handles else time.sleep(timeout_s)
 
     def _launch(self, child: _Child) -> None:
-        child.attempt += 1
         self._logs.mkdir(parents=True, exist_ok=True)
         log = self._logs / f"{self._prefix}-{child.name}.{child.attempt}.log"
         pipe, childs_end = _context.Pipe()
@@ -225,25 +173,15 @@ class Supervisor:
         childs_end.close()
         child.running = _Process(process, pipe, log)
 
-    def _bury(self, child: _Child, running: _Process) -> Event:
+    def _ended(self, child: _Child, running: _Process) -> Finished | Failed:
         exit_code = running.process.exitcode
         assert exit_code is not None
         running.close()
-        child.running = None
-        if isinstance(running.last_words, Finished):
-            del self._children[child.name]
-            return Ended(child.name, running.last_words.outcome)
-        words = running.last_words
-        reason = words.traceback if words else f"{_describe(exit_code)}; its log is {running.log}"
-        delay = None if child.is_stopping else child.restarts.next_delay()
-        if delay is None:
-            del self._children[child.name]
-        else:
-            child.due = time.monotonic() + delay
-        return Died(child.name, child.attempt, reason, delay is not None)
+        del self._children[child.name]
+        return running.last_words or Failed(f"{_describe(exit_code)}; its log is {running.log}")
 
 
-def _heard(running: _Process) -> list[Report]:
+def _received(running: _Process) -> list[Report]:
     """Return what a child said, and remember its last words."""
     reports: list[Report] = []
     try:

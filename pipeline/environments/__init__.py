@@ -1,6 +1,6 @@
 """Environments: registration with Gymnasium, and batches of simulators for training.
 
-``gymnasium.make("oodil/Hopper-v0", gravity=12.0)`` works wherever oodil is installed (`registration`).
+Importing this package registers ours, and so does ``import oodil`` once Gymnasium is there (`registration`).
 """
 
 import math
@@ -17,7 +17,6 @@ from oodil.pipeline.environments.registration import register_environments
 from oodil.pipeline.environments.replay import ReplayBatch, box_spaces, refuse_randomness
 from oodil.pipeline.errors import UnusableEnvironmentError
 
-# An installed oodil is registered by its entry point; one that is only on the path is not.
 register_environments()
 
 

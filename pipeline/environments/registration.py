@@ -1,6 +1,7 @@
-"""The ids of our environments, known to Gymnasium as soon as oodil is installed (entry point ``gymnasium.envs``).
+"""The ids of our environments. Nothing heavy is loaded here but Gymnasium itself.
 
-Gymnasium calls `register_environments` while it is imported itself, so nothing heavy is loaded here.
+Gymnasium 1 loads no plugins: an id is known once a module has registered it. It imports oodil by itself for
+``gymnasium.make("oodil:oodil/Hopper-v0")``; after ``import oodil`` the plain id will do.
 """
 
 from typing import Any

@@ -8,6 +8,7 @@ The public interface; everything is loaded when it is first used, so that ``impo
 >>> action = results.policy().act(observation)  # doctest: +SKIP
 """
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -80,6 +81,11 @@ _HOMES = {
     "oodil.pipeline.stage": ("register",),
     "oodil.pipeline.stages": ("PolicyStage", "Weighting"),
 }
+
+
+if "gymnasium" in sys.modules:
+    # Gymnasium loads no plugins by itself; whoever has it loaded wants our environments, too, and nobody else waits.
+    import_module("oodil.pipeline.environments.registration").register_environments()
 
 
 def __getattr__(name: str) -> Any:

@@ -12,7 +12,8 @@ from oodil.pipeline.loading import load_config
 from oodil.pipeline.results import Evaluation, Policy
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.seeding import derive_key
-from oodil.workers.engine import Engine, LocalEngine
+from oodil.workers.engine import Engine
+from oodil.workers.local_engine import LocalEngine
 
 __all__ = ["evaluate", "open_run", "run"]
 

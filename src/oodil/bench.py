@@ -13,8 +13,9 @@ from oodil.pipeline.artifacts import Files, RunDirectory
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.environments import make_batch
-from oodil.pipeline.stage import JobContext, Run, Stage
-from oodil.workers.engine import Event, JobFailed, JobProgress, LocalEngine
+from oodil.pipeline.stage import JobContext, Run, Stage, register
+from oodil.workers.local_engine import LocalEngine
+from oodil.workers.reports import AttemptFailed, Event, Progress
 
 WARM_UP = 0.3
 """Share of a learner's run that is not counted: processes start, and untrained robots fall all the time."""
@@ -44,20 +45,19 @@ def worker_counts() -> list[int]:
 
 def learner_rate(config: RunConfig, workers: int) -> dict[str, float]:
     """Return steps per second of the learner loop after its warm-up, and the mean episode length at its end."""
-    seen: list[tuple[float, JobProgress]] = []
+    seen: list[tuple[float, Progress]] = []
 
     def on_event(event: Event) -> None:
-        if isinstance(event, JobProgress):
-            seen.append((time.perf_counter(), event))
-        elif isinstance(event, JobFailed):
-            raise RuntimeError(event.reason)
+        if isinstance(event.report, Progress):
+            seen.append((time.perf_counter(), event.report))
+        elif isinstance(event.report, AttemptFailed):
+            raise RuntimeError(event.report.reason)
 
     with tempfile.TemporaryDirectory() as folder:
         run = Run(config, RunDirectory(Path(folder)))
         run.directory.config.write_text(config.model_dump_json())
-        engine = LocalEngine(workers, "oodil.bench:stage_named")
-        engine.run_jobs(LearnerLoop(), run, ["loop"], on_event, lambda: False)
-    timed = [(at, event) for at, event in seen if event.done >= WARM_UP * event.total]
+        LocalEngine(workers).run_jobs(LearnerLoop(), run, ["loop"], on_event, lambda: False)
+    timed = [(at, report) for at, report in seen if report.done >= WARM_UP * report.total]
     (start, first), (end, last) = timed[0], timed[-1]
     length = last.metrics.get("length", float("nan"))
     return {"steps_per_s": (last.done - first.done) / (end - start), "episode_length": length}
@@ -91,11 +91,6 @@ class LearnerLoop(Stage):
         return {}
 
 
-def stage_named(config: RunConfig, name: str) -> Stage:
-    """Return the only stage there is; the engine's processes find it here."""
-    return LearnerLoop()
-
-
 def random_demonstrations(env_id: str, count: int = 10) -> Demonstrations:
     """Return demonstrations of random actions: what is imitated does not matter for speed, only how much of it."""
     batch = make_batch(env_id, {}, count)
@@ -108,3 +103,6 @@ def random_demonstrations(env_id: str, count: int = 10) -> Demonstrations:
         states[:, t] = batch.observations()
         batch.step(rng.uniform(-1, 1, (count, batch.action_dim)))
     return Demonstrations.of([Episode(part) for part in states], "random")
+
+
+register(LearnerLoop())

@@ -353,7 +353,7 @@ def _engine(
     """Return where jobs run; refuse options that belong to another engine."""
     if name == "local":
         from oodil.workers.channels import open_access
-        from oodil.workers.engine import LocalEngine
+        from oodil.workers.local_engine import LocalEngine
 
         if trust_cluster:
             raise ConfigError("--trust-cluster belongs to --engine ray")

@@ -17,7 +17,8 @@ from rich.table import Table
 
 from oodil.orchestrator import Observer
 from oodil.pipeline.runs import RunResults, shown_return
-from oodil.workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, JobWarning, WorkerRestarted
+from oodil.workers.reports import DONE, AttemptFailed, Event, Finished, Replaced, Started, Warn
+from oodil.workers.reports import Progress as JobProgress
 
 if TYPE_CHECKING:
     from oodil.pipeline.data import Demonstrations
@@ -108,19 +109,19 @@ class Display(Observer):
     def event(self, event: Event) -> None:
         """Show what an engine reports."""
         match event:
-            case JobStarted(job=job):
+            case Event(job, Started()):
                 self._bar(job)
-            case JobProgress(job=job, done=done, total=total, metrics=metrics):
+            case Event(job, JobProgress(done, total, metrics)):
                 self._advance(job, done, total, metrics)
-            case JobWarning(job=job, message=message):
+            case Event(job, Warn(message)):
                 self.say(f"[yellow]! {job}: {message}[/]")
-            case JobFailed(job=job, attempt=attempt, will_retry=will_retry, reason=reason):
+            case Event(job, AttemptFailed(attempt, reason, will_retry)):
                 then = "trying again" if will_retry else "giving up"
                 self.say(f"[red]✗ {job}: attempt {attempt} failed, {then}: {reason.strip().splitlines()[-1]}[/]")
-            case JobDone(job=job):
-                if job in self._bars:
+            case Event(job, Finished(outcome)):
+                if job in self._bars and outcome == DONE:
                     self._progress.update(self._bars[job], completed=1, total=1, figures="done")
-            case WorkerRestarted(worker=worker, reason=reason):
+            case Event(worker, Replaced(reason)):
                 self.say(f"[yellow]! {worker}: {reason}; started again[/]")
 
     def _bar(self, job: str) -> Any:

@@ -15,8 +15,9 @@ from oodil.pipeline.collecting import InlineRollouts, collect
 from oodil.pipeline.data import Unit, UnitResult
 from oodil.pipeline.stage import JobStoppedError
 from oodil.pipeline.versions import collecting_versions
-from oodil.workers import learner, rollout
+from oodil.workers import rollout_worker, zmq_rollouts
 from oodil.workers.channels import Dealer, private_endpoint
+from oodil.workers.dispatcher import UNITS_PER_WORKER, CollectError
 from oodil.workers.messages import (
     Header,
     Message,
@@ -28,9 +29,9 @@ from oodil.workers.messages import (
     decode,
     encode,
 )
-from oodil.workers.supervisor import Died, Restarts, Started, Supervisor
-from oodil.workers.supervisor import Event as ChildEvent
-from oodil.workers.zmq_rollouts import CollectError, Dispatcher, ZmqRollouts
+from oodil.workers.reports import Event, Failed, Started
+from oodil.workers.supervisor import Supervisor
+from oodil.workers.zmq_rollouts import ZmqRollouts
 from tests.fakes import chain, hopper_units, wait_until
 
 pytestmark = pytest.mark.timeout(120)
@@ -49,7 +50,7 @@ class Threads:
             thread.start()
 
     def _run(self, endpoint: str, identity: str) -> None:
-        rollout.main(_Link(identity, self._stop.is_set), endpoint, RUN)  # type: ignore[arg-type]
+        rollout_worker.main(_Link(identity, self._stop.is_set), endpoint, RUN)  # type: ignore[arg-type]
 
     def close(self) -> None:
         """End them."""
@@ -134,7 +135,7 @@ def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
         with lock:
             return collect(unit)
 
-    monkeypatch.setattr(rollout, "collect", collect_alone)
+    monkeypatch.setattr(rollout_worker, "collect", collect_alone)
     monkeypatch.setattr(oodil.pipeline.collecting, "collect", collect_alone)
 
 
@@ -232,7 +233,7 @@ def test_late_units_go_to_a_worker_with_nothing_to_do(
     hoarder = Puppet(endpoint, "hoarder.1")
     source.submit(units)
     hoarder.ready()
-    held = [hoarder.next_unit() for _ in range(learner.UNITS_PER_WORKER)]
+    held = [hoarder.next_unit() for _ in range(UNITS_PER_WORKER)]
     workers = Threads(endpoint, 1)
     try:
         assert_same_bits(source.gather(), inline(units))
@@ -281,7 +282,7 @@ def test_a_stop_ends_the_wait_only_when_nobody_answers(
         rollouts.submit(hopper_units(0))
         assert_same_bits(rollouts.gather(), inline(hopper_units(0)))
         workers.close()
-        monkeypatch.setattr(learner, "_STOP_PATIENCE_S", 0.3)
+        monkeypatch.setattr(zmq_rollouts, "_STOP_PATIENCE_S", 0.3)
         rollouts.submit(hopper_units(1))
         with pytest.raises(JobStoppedError):
             rollouts.gather()
@@ -296,14 +297,15 @@ def test_a_worker_process_that_dies_or_hangs_is_replaced_and_changes_nothing(
     tmp_path: Path, endpoint: str, is_killed: bool, assert_same_bits: SameBits
 ) -> None:
     units = hopper_units(0)
+    arguments = {"endpoint": endpoint, "run_id": RUN}
     silent: list[str] = []
-    events: list[ChildEvent] = []
+    events: list[Event] = []
     rollouts = ZmqRollouts(endpoint, RUN, "learner.1", unit_timeout_s=5.0, report_silent=silent.append)
     results: list[UnitResult] = []
     gathering = threading.Thread(target=lambda: results.extend(rollouts.gather()), daemon=True)
     with Supervisor(tmp_path, "test") as supervisor:
         try:
-            supervisor.start("worker", rollout.main, {"endpoint": endpoint, "run_id": RUN}, Restarts(20, 0.0))
+            supervisor.start("worker", rollout_worker.main, arguments)
             supervisor.poll(0.0)
             wait_until(lambda: bool(rollouts._dispatcher._workers))
             (process,) = multiprocessing.active_children()
@@ -319,73 +321,19 @@ def test_a_worker_process_that_dies_or_hangs_is_replaced_and_changes_nothing(
             def is_gathered() -> bool:
                 while silent:
                     supervisor.kill(silent.pop())
-                events.extend(supervisor.poll(0.05))
+                for event in supervisor.poll(0.05):
+                    events.append(event)
+                    if isinstance(event.report, Failed):
+                        supervisor.start("worker", rollout_worker.main, arguments)
                 return not gathering.is_alive()
 
             wait_until(is_gathered, 60.0)
         finally:
             rollouts.close()
     assert_same_bits(results, inline(units))
-    assert [type(event) for event in events[:2]] == [Died, Started]
-    assert isinstance(events[0], Died) and events[0].reason.startswith("killed by SIGKILL")
-
-
-# --- the dispatcher alone, with its own clock --------------------------------------------------------------------
-
-
-def names(given: list[tuple[str, Unit]]) -> list[tuple[str, int]]:
-    """Return who got which group."""
-    return [(worker, unit.group) for worker, unit in given]
-
-
-def dispatcher(count: int, *workers: str) -> Dispatcher:
-    """Return a dispatcher with the units of one iteration and some workers."""
-    made = Dispatcher(unit_timeout_s=30.0)
-    made.submit(hopper_units(0, count))
-    for worker in workers:
-        made.ready(worker)
-    return made
-
-
-def test_work_is_spread_evenly_and_at_most_two_units_wait_at_a_worker() -> None:
-    units = dispatcher(6, "a", "b")
-    assert names(units.assign(0.0)) == [("a", 0), ("b", 1), ("a", 2), ("b", 3)]
-    assert units.assign(0.5) == []
-    units.result("b", inline(hopper_units(0)[1:2])[0], 0.6)
-    assert names(units.assign(0.6)) == [("b", 4)]
-
-
-def test_a_unit_is_late_when_it_takes_far_longer_than_the_slowest_recent_one() -> None:
-    units = dispatcher(2, "a", "b")
-    assert names(units.assign(0.0)) == [("a", 0), ("b", 1)]
-    units.result("b", inline(hopper_units(0)[1:2])[0], 2.0)
-    assert units.assign(9.9) == []
-    assert names(units.assign(10.1)) == [("b", 0)]
-    assert units.assign(10.2) == []
-
-
-def test_a_silent_worker_is_named_once_and_its_units_go_to_others() -> None:
-    units = dispatcher(3, "a")
-    assert names(units.assign(0.0)) == [("a", 0), ("a", 1)]
-    units.result("a", inline(hopper_units(0)[:1])[0], 20.0)
-    assert names(units.assign(20.0)) == [("a", 2)]
-    assert units.silent(49.0) == []
-    assert units.silent(51.0) == ["a"]
-    assert units.silent(90.0) == []
-    units.ready("b")
-    assert sorted(names(units.assign(90.0))) == [("b", 1), ("b", 2)]
-
-
-def test_a_failed_unit_returns_to_the_same_worker_only_if_there_is_no_other() -> None:
-    units = dispatcher(1, "a")
-    units.assign(0.0)
-    units.failed("a", (0, 0), "first", 0.1)
-    assert names(units.assign(0.1)) == [("a", 0)]
-    units.failed("a", (0, 0), "second", 0.2)
-    units.ready("b")
-    assert names(units.assign(0.2)) == [("b", 0)]
-    with pytest.raises(CollectError, match=r"(?s)failed 3 times, last in b.*third"):
-        units.failed("b", (0, 0), "third", 0.3)
+    failed, again = events[0].report, events[1].report
+    assert isinstance(failed, Failed) and failed.reason.startswith("killed by SIGKILL")
+    assert again == Started(2)
 
 
 def test_a_worker_with_other_libraries_is_refused_with_the_reason(endpoint: str, source: ZmqRollouts) -> None:

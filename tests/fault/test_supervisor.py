@@ -8,15 +8,15 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from oodil.workers.channels import endpoint_folder
-from oodil.workers.engine import Event, JobFailed, JobWarning, LocalEngine, WorkerRestarted
-from oodil.workers.reports import Progress
-from oodil.workers.supervisor import Died, Ended, Link, Restarts, Said, Started, Supervisor
-from oodil.workers.supervisor import Event as ChildEvent
-from tests.fakes import STAGES, FakeStage, fake_run, lines, wait_until
+from oodil.workers.local_engine import LocalEngine
+from oodil.workers.reports import AttemptFailed, Event, Failed, Finished, Progress, Replaced, Started, Warn
+from oodil.workers.supervisor import Link, Supervisor
+from tests.fakes import FakeStage, failures, fake_run, lines, wait_until
 
 pytestmark = pytest.mark.timeout(120)
 ROOT = Path(__file__).parents[2]
@@ -56,21 +56,20 @@ def vanishes(link: Link) -> str:
     os._exit(0)
 
 
-def poll_until(supervisor: Supervisor, kind: type, timeout_s: float = 30.0) -> ChildEvent:
-    """Return the first event of a kind."""
+def poll_until(supervisor: Supervisor, kind: type, timeout_s: float = 30.0) -> Any:
+    """Return the first report of a kind."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
         for event in supervisor.poll(0.1):
-            if isinstance(event, kind):
-                return event
+            if isinstance(event.report, kind):
+                return event.report
     raise TimeoutError(f"no {kind.__name__} within {timeout_s:g} s")
 
 
 def started(supervisor: Supervisor) -> int:
     """Return the process id that a child says when it is up."""
-    said = poll_until(supervisor, Said)
-    assert isinstance(said, Said) and isinstance(said.report, Progress)
-    return said.report.done
+    pid: int = poll_until(supervisor, Progress).done
+    return pid
 
 
 def is_alive(pid: int) -> bool:
@@ -85,22 +84,19 @@ def test_a_child_computes_with_one_thread_and_writes_its_log(tmp_path: Path, mon
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     with Supervisor(tmp_path, "stage") as supervisor:
-        supervisor.start("child", describes_itself, {}, Restarts(0, 0.0))
-        assert poll_until(supervisor, Ended) == Ended("child", "1 True True")
+        supervisor.start("child", describes_itself, {})
+        assert poll_until(supervisor, Finished) == Finished("1 True True")
     assert (os.environ["OMP_NUM_THREADS"], os.environ.get("MKL_NUM_THREADS")) == ("7", None)
     assert (tmp_path / "stage-child.1.log").read_text() == "to the log\nto the log as well\n"
 
 
-def test_a_killed_child_is_started_again_until_its_restarts_are_used(tmp_path: Path) -> None:
+def test_the_signal_that_killed_a_child_is_told(tmp_path: Path) -> None:
     with Supervisor(tmp_path, "stage") as supervisor:
-        supervisor.start("child", obedient, {}, Restarts(1, 0.0))
-        os.kill(started(supervisor), signal.SIGKILL)
-        died = poll_until(supervisor, Died)
-        assert isinstance(died, Died) and died.restarts and died.reason.startswith("killed by SIGKILL")
-        os.kill(started(supervisor), signal.SIGSEGV)
-        died = poll_until(supervisor, Died)
-        assert isinstance(died, Died) and not died.restarts and died.reason.startswith("killed by SIGSEGV")
-        assert supervisor.poll(0.0) == []
+        for number in (signal.SIGKILL, signal.SIGSEGV):
+            supervisor.start("child", obedient, {})
+            os.kill(started(supervisor), number)
+            assert poll_until(supervisor, Failed).reason.startswith(f"killed by {number.name}")
+            assert supervisor.poll(0.0) == []
 
 
 @pytest.mark.parametrize(
@@ -108,28 +104,21 @@ def test_a_killed_child_is_started_again_until_its_restarts_are_used(tmp_path: P
 )
 def test_the_reason_of_a_failure_is_told(tmp_path: Path, main: object, reason: str) -> None:
     with Supervisor(tmp_path, "stage") as supervisor:
-        supervisor.start("child", main, {}, Restarts(0, 0.0))  # type: ignore[arg-type]
-        died = poll_until(supervisor, Died)
-        assert isinstance(died, Died) and reason in died.reason
-
-
-def test_pauses_double_up_to_a_limit() -> None:
-    restarts = Restarts(8, 0.5)
-    assert [restarts.next_delay() for _ in range(9)] == [0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0, 10.0, None]
+        supervisor.start("child", main, {})  # type: ignore[arg-type]
+        assert reason in poll_until(supervisor, Failed).reason
 
 
 def test_ctrl_c_does_not_reach_children_and_a_stop_does(tmp_path: Path) -> None:
     with Supervisor(tmp_path, "stage") as supervisor:
-        supervisor.start("child", obedient, {}, Restarts(0, 0.0))
+        supervisor.start("child", obedient, {})
         os.kill(started(supervisor), signal.SIGINT)
         assert supervisor.stop("child")
-        assert poll_until(supervisor, Ended) == Ended("child", "stopped")
+        assert poll_until(supervisor, Finished) == Finished("stopped")
 
 
-def test_a_child_that_waits_for_its_restart_is_stopped_at_once(tmp_path: Path) -> None:
+def test_a_child_that_waits_for_its_start_is_dropped_by_a_stop(tmp_path: Path) -> None:
     with Supervisor(tmp_path, "stage") as supervisor:
-        supervisor.start("child", broken, {}, Restarts(5, 1000.0))
-        poll_until(supervisor, Died)
+        supervisor.start("child", broken, {}, delay_s=1000.0)
         assert not supervisor.stop("child")
         assert supervisor.poll(0.0) == []
 
@@ -138,7 +127,7 @@ def test_a_child_that_waits_for_its_restart_is_stopped_at_once(tmp_path: Path) -
 @pytest.mark.parametrize("is_suspended", [False, True])
 def test_closing_ends_every_child_and_can_be_repeated(tmp_path: Path, main: object, is_suspended: bool) -> None:
     supervisor = Supervisor(tmp_path, "stage")
-    supervisor.start("child", main, {}, Restarts(5, 0.0))  # type: ignore[arg-type]
+    supervisor.start("child", main, {})  # type: ignore[arg-type]
     pid = started(supervisor)
     if is_suspended:
         os.kill(pid, signal.SIGSTOP)
@@ -150,25 +139,26 @@ def test_closing_ends_every_child_and_can_be_repeated(tmp_path: Path, main: obje
 
 def test_only_the_named_attempt_is_killed(tmp_path: Path) -> None:
     with Supervisor(tmp_path, "stage") as supervisor:
-        supervisor.start("child", obedient, {}, Restarts(5, 0.0))
+        supervisor.start("child", obedient, {})
         os.kill(started(supervisor), signal.SIGKILL)
+        poll_until(supervisor, Failed)
+        supervisor.start("child", obedient, {})
+        assert poll_until(supervisor, Started) == Started(2)
         second = started(supervisor)
         supervisor.kill("child.1")
         supervisor.poll(0.1)
         assert is_alive(second)
         supervisor.kill("child.2")
-        assert isinstance(poll_until(supervisor, Died), Died)
-        assert poll_until(supervisor, Started) == Started("child", 3)
+        assert poll_until(supervisor, Failed).reason.startswith("killed by SIGKILL")
 
 
 def test_a_job_that_is_killed_continues_from_its_checkpoint(tmp_path: Path) -> None:
     run = fake_run(tmp_path)
     events: list[Event] = []
-    outcome = LocalEngine(1, STAGES).run_jobs(FakeStage(False), run, ["killed", "a"], events.append, lambda: False)
+    outcome = LocalEngine(1).run_jobs(FakeStage(False), run, ["killed", "a"], events.append, lambda: False)
     assert outcome.done == ["killed", "a"] and not outcome.failed
-    failures = [event for event in events if isinstance(event, JobFailed)]
-    assert [(event.job, event.will_retry) for event in failures] == [("killed", True)]
-    assert "SIGKILL" in failures[0].reason
+    assert failures(events) == [("killed", 1, True)]
+    assert "SIGKILL" in next(e.report.reason for e in events if isinstance(e.report, AttemptFailed))
     assert lines(tmp_path / "killed.began_at") == ["0", "3"]
     assert run.job_artifact("jobs", "killed").sha256 == run.job_artifact("jobs", "a").sha256
 
@@ -176,10 +166,10 @@ def test_a_job_that_is_killed_continues_from_its_checkpoint(tmp_path: Path) -> N
 def test_a_job_that_hangs_is_killed_and_continues_from_its_checkpoint(tmp_path: Path) -> None:
     run = fake_run(tmp_path, job_timeout_s=4.0)
     events: list[Event] = []
-    outcome = LocalEngine(1, STAGES).run_jobs(FakeStage(False), run, ["frozen", "a"], events.append, lambda: False)
+    outcome = LocalEngine(1).run_jobs(FakeStage(False), run, ["frozen", "a"], events.append, lambda: False)
     assert outcome.done == ["frozen", "a"] and not outcome.failed
-    warnings = [event for event in events if isinstance(event, JobWarning)]
-    assert [(event.job, "job_timeout_s" in event.message) for event in warnings] == [("frozen", True)]
+    warnings = [(event.name, event.report.text) for event in events if isinstance(event.report, Warn)]
+    assert [(job, "job_timeout_s" in text) for job, text in warnings] == [("frozen", True)]
     assert lines(tmp_path / "frozen.began_at") == ["0", "3"]
     assert run.job_artifact("jobs", "frozen").sha256 == run.job_artifact("jobs", "a").sha256
 
@@ -187,9 +177,9 @@ def test_a_job_that_hangs_is_killed_and_continues_from_its_checkpoint(tmp_path: 
 def test_a_killed_learner_finds_its_workers_again(tmp_path: Path) -> None:
     run = fake_run(tmp_path)
     events: list[Event] = []
-    outcome = LocalEngine(2, STAGES).run_jobs(FakeStage(True), run, ["killed", "a"], events.append, lambda: False)
+    outcome = LocalEngine(2).run_jobs(FakeStage(True), run, ["killed", "a"], events.append, lambda: False)
     assert outcome.done == ["killed", "a"] and not outcome.failed
-    assert not [event for event in events if isinstance(event, WorkerRestarted)]
+    assert not [event for event in events if isinstance(event.report, Replaced)]
     assert lines(tmp_path / "killed.began_at") == ["0", "3"]
     assert run.job_artifact("learner", "killed").sha256 == run.job_artifact("learner", "a").sha256
 
@@ -200,7 +190,7 @@ def test_workers_that_keep_dying_fail_the_stage(tmp_path: Path) -> None:
     killer = threading.Thread(target=_kill_workers, args=(stop,))
     killer.start()
     try:
-        outcome = LocalEngine(1, STAGES).run_jobs(FakeStage(True), run, ["a", "b"], lambda event: None, lambda: False)
+        outcome = LocalEngine(1).run_jobs(FakeStage(True), run, ["a", "b"], lambda event: None, lambda: False)
     finally:
         stop.set()
         killer.join()
@@ -221,16 +211,16 @@ def test_nothing_is_left_when_the_orchestrator_is_killed(tmp_path: Path, distrib
     run = fake_run(tmp_path)
     code = f"""
 from pathlib import Path
-from tests.fakes import FakeStage, STAGES, fake_run
-from oodil.workers.engine import LocalEngine
+from tests.fakes import FakeStage, fake_run
+from oodil.workers.local_engine import LocalEngine
 
 if __name__ == "__main__":
     run = fake_run(Path({str(tmp_path)!r}))
-    LocalEngine(2, STAGES).run_jobs(FakeStage({distributed}), run, ["waits", "a"], print, lambda: False)
+    LocalEngine(2).run_jobs(FakeStage({distributed}), run, ["waits", "a"], print, lambda: False)
 """
     script = tmp_path / "orchestrator.py"
     script.write_text(code)
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT}"}
     parent = subprocess.Popen([sys.executable, str(script)], env=environment, start_new_session=True)
     try:
         wait_until(lambda: len(lines(tmp_path / "waits.iterations")) >= 2)
@@ -243,7 +233,7 @@ if __name__ == "__main__":
 
     (tmp_path / "go").touch()
     stage = FakeStage(distributed)
-    outcome = LocalEngine(1, STAGES).run_jobs(stage, run, ["waits"], lambda event: None, lambda: False)
+    outcome = LocalEngine(1).run_jobs(stage, run, ["waits"], lambda event: None, lambda: False)
     assert outcome.done == ["waits"]
     assert lines(tmp_path / "waits.began_at") == ["0", "2"]
     assert not endpoint_folder(tmp_path).exists()
@@ -271,7 +261,7 @@ def test_an_exception_in_the_orchestrator_ends_everything_at_once(tmp_path: Path
         return False
 
     with pytest.raises(KeyboardInterrupt):
-        LocalEngine(2, STAGES).run_jobs(FakeStage(True), run, ["waits"], lambda event: None, interrupt)
+        LocalEngine(2).run_jobs(FakeStage(True), run, ["waits"], lambda event: None, interrupt)
     assert not multiprocessing.active_children()
     assert not endpoint_folder(tmp_path).exists()
     (pid,) = lines(tmp_path / "waits.attempts")

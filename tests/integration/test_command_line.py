@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from oodil.cli import app
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.datasets import encode_demonstrations
+from oodil.pipeline.loading import load_config
 from tests.runs import MICRO, ROOT
 
 HOPPER = "oodil/Hopper-v0"
@@ -72,8 +73,29 @@ def test_configuration(tmp_path: Path, override: str, message: str) -> None:
     assert not (tmp_path / "run").exists()
 
 
+def test_shipped_configurations_are_listed_and_copied(tmp_path: Path) -> None:
+    listed = CliRunner().invoke(app, ["configs"]).output
+    assert all(name in listed for name in ("quickstart", "hopper", "quick/driving"))
+    copied = CliRunner().invoke(app, ["configs", "--copy", str(tmp_path / "mine")])
+    assert copied.exit_code == 0, copied.output
+    assert load_config(tmp_path / "mine" / "smoke.yaml") != load_config("smoke"), "experts are those of the copy"
+    assert "exists already" in refused("configs", "--copy", str(tmp_path / "mine"))
+    assert "did you mean 'hopper'?" in refused("run", "hoper", "--run-dir", str(tmp_path / "run"))
+
+
+def test_a_defect_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only what the user can mend becomes a message; a missing key in our own code does not."""
+
+    def broken(*_: object) -> None:
+        raise KeyError("weights")
+
+    monkeypatch.setattr("oodil.orchestrator.check_inputs", broken)
+    result = CliRunner().invoke(app, ["run", str(MICRO)])
+    assert isinstance(result.exception, KeyError) and result.exit_code == 1
+
+
 def test_configuration_file_that_is_missing_or_no_mapping(tmp_path: Path) -> None:
-    assert "nowhere.yaml: No such file" in refused("run", str(tmp_path / "nowhere.yaml"))
+    assert "nowhere.yaml: no such file" in refused("run", str(tmp_path / "nowhere.yaml"))
     (tmp_path / "list.yaml").write_text("- 1\n")
     assert "expected a mapping" in refused("run", str(tmp_path / "list.yaml"))
 
@@ -147,3 +169,27 @@ def test_a_run_directory_of_another_run(tmp_path: Path) -> None:
 def test_what_is_no_run(tmp_path: Path) -> None:
     for command in ("status", "resume", "report", "evaluate"):
         assert "is not a run" in refused(command, str(tmp_path))
+
+
+def test_a_folder_that_cannot_be_made_and_a_file_that_cannot_be_written(config_for, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    inside = str(tmp_path / "file" / "run")
+    assert f"{inside}: Not a directory" in refused("run", str(MICRO), "--run-dir", inside)
+    _, file = config_for(safetensors.numpy.save(arrays()))
+    (tmp_path / "states.npz").write_bytes(b"")
+    np.savez(tmp_path / "states.npz", *np.zeros((2, 5, 12), np.float32))
+    target = tmp_path / "file" / "out.safetensors"
+    convert = ("demos", "convert", str(tmp_path / "states.npz"), "--environment", HOPPER, "--output", str(target))
+    assert f"{target}: Not a directory" in refused(*convert)
+
+
+def test_a_damaged_artifact_is_one_message(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    until = ("--run-dir", str(run_dir), "--workers", "0", "--until", "demonstrations")
+    result = CliRunner().invoke(app, ["run", str(MICRO), *until])
+    assert result.exit_code == 0, result.output
+    (file,) = (run_dir / "stages" / "demonstrations").glob("*.safetensors")
+    file.write_bytes(file.read_bytes()[:-1])
+    assert "demonstrations is damaged" in refused("demos", "inspect", str(run_dir))
+    (run_dir / "config.json").write_text("{")
+    assert "config.json: cannot be read" in refused("status", str(run_dir))

@@ -7,18 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from oodil.orchestrator import execute
 from oodil.pipeline.algorithms.weights import sampling_mass
-from oodil.pipeline.artifacts import RunDirectory, encode_arrays, write_artifact
+from oodil.pipeline.artifacts import RunDirectory, write_artifact
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.datasets import encode_demonstrations
 from oodil.pipeline.environments import make_batch
 from oodil.pipeline.evaluation import run_episodes
-from oodil.pipeline.experts import load_expert
 from oodil.pipeline.loading import parse_config
+from oodil.pipeline.results import Assignment, CollectedDemonstrations
 from oodil.pipeline.seeding import numpy_rng
 from oodil.pipeline.stage import Run
+from oodil.pipeline.stages.experts import load_expert
+from oodil.pipeline.stages.imitators import ImitatorsStage
 from oodil.pipeline.stages.transferability import TransferabilityStage
-from oodil.workers.engine import LocalEngine
+from oodil.workers.local_engine import LocalEngine
 from tests.runs import ROOT
 
 pytestmark = pytest.mark.timeout(1200)
@@ -58,17 +61,15 @@ def test_an_expert_is_transferable_and_doing_nothing_is_not(tmp_path: Path) -> N
     run = Run(config, RunDirectory(tmp_path / "run"))
     run.directory.path.mkdir()
     run.directory.config.write_text(config.model_dump_json())
-    write_artifact(run.directory.stage("demonstrations"), {}, {file.name: file.read_bytes()})
-    labels = encode_arrays({"labels": demonstrations.sources})
-    write_artifact(run.directory.stage("clustering"), {}, {"assignment.safetensors": labels})
-
-    stage = TransferabilityStage()
-    outcome = LocalEngine(2).run_jobs(stage, run, stage.jobs(run), lambda _: None, lambda: False)
-    assert not outcome.failed, outcome.failed
-    write_artifact(run.directory.stage(stage.name), {}, stage.combine(run))
-    arrays = run.artifact(stage.name).arrays("transferability.safetensors")
-    scores = arrays["scores"]
+    collected = CollectedDemonstrations(demonstrations, (), "oodil/Hopper-v0")
+    write_artifact(run.directory.stage("demonstrations"), {}, collected.files())
+    assignment = Assignment(demonstrations.sources, np.zeros((2 * COUNT, 2), np.float32))
+    write_artifact(run.directory.stage("clustering"), {}, assignment.files())
+    weighting = TransferabilityStage()
+    execute(run, [ImitatorsStage(), weighting], LocalEngine(2))
+    found = weighting.load(run)
+    scores = found.scores
     # A settled discriminator is not sure of what can be reproduced, but is of much else: docs/decisions.md.
     assert scores[~does_nothing].min() > 0.05, scores
     assert scores[does_nothing].max() < scores[~does_nothing].min() / 2, scores
-    assert sampling_mass(arrays["weights"], demonstrations)[does_nothing].sum() < 0.05, scores
+    assert sampling_mass(found.weights, demonstrations)[does_nothing].sum() < 0.05, scores

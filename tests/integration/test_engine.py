@@ -10,8 +10,10 @@ import pytest
 from oodil.pipeline.artifacts import read_artifact
 from oodil.pipeline.stage import Run
 from oodil.workers.channels import endpoint_folder
-from oodil.workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, LocalEngine, Outcome
-from tests.fakes import STAGES, FakeStage, fake_run, lines
+from oodil.workers.engine import Outcome
+from oodil.workers.local_engine import LocalEngine
+from oodil.workers.reports import DONE, Event, Finished, Progress, Started
+from tests.fakes import FakeStage, failures, fake_run, lines
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -19,7 +21,7 @@ pytestmark = pytest.mark.timeout(120)
 def run_jobs(run: Run, workers: int, jobs: list[str], distributed: bool = False) -> tuple[Outcome, list[Event]]:
     """Run jobs of a fake stage to the end."""
     events: list[Event] = []
-    engine = LocalEngine(workers, STAGES)
+    engine = LocalEngine(workers)
     outcome = engine.run_jobs(FakeStage(distributed), run, jobs, events.append, lambda: False)
     assert not multiprocessing.active_children()
     assert not endpoint_folder(run.directory.path).exists()
@@ -39,8 +41,8 @@ def test_the_result_does_not_depend_on_the_number_of_workers(tmp_path: Path, dis
         run = fake_run(tmp_path / str(workers))
         outcome, events = run_jobs(run, workers, ["a", "b"], distributed)
         assert outcome == Outcome(done=["a", "b"])
-        assert [event for event in events if isinstance(event, JobStarted | JobDone)].count(JobDone("a")) == 1
-        assert any(isinstance(event, JobProgress) and (event.done, event.total) == (6, 6) for event in events)
+        assert events.count(Event("a", Started(1))) == events.count(Event("a", Finished(DONE))) == 1
+        assert any(isinstance(e.report, Progress) and (e.report.done, e.report.total) == (6, 6) for e in events)
         assert not run.directory.checkpoints(stage, "a").exists()
         assert "torch" in run.job_artifact(stage, "a").versions
         hashes |= {content(run, stage, "a"), content(run, stage, "b")}
@@ -55,9 +57,19 @@ def test_a_failing_job_keeps_its_first_traceback_and_does_not_end_the_others(tmp
     assert outcome.failed.keys() == {"raises"}
     assert "ArithmeticError: told to, in attempt 1" in outcome.failed["raises"]
     assert not outcome.stopped and not outcome.not_run
-    assert [(e.attempt, e.will_retry) for e in events if isinstance(e, JobFailed)] == [(1, True), (2, True), (3, False)]
+    assert failures(events) == [("raises", 1, True), ("raises", 2, True), ("raises", 3, False)]
     assert read_artifact(run.directory.job("jobs", "raises")) is None
-    assert lines(tmp_path / "raises.began_at") == ["0", "2", "3"]
+    assert lines(tmp_path / "raises.began_at") == ["0", "2", "2"]
+
+
+@pytest.mark.parametrize(("workers", "job"), [(0, "raises_often"), (1, "killed_often")])
+def test_attempts_that_get_further_do_not_use_any_up(tmp_path: Path, workers: int, job: str) -> None:
+    run = fake_run(tmp_path, max_attempts=2)
+    outcome, events = run_jobs(run, workers, [job, "a"])
+    assert outcome == Outcome(done=[job, "a"])
+    assert failures(events) == [(job, attempt, True) for attempt in range(1, 7)]
+    assert lines(tmp_path / f"{job}.began_at") == ["0", "1", "2", "3", "4", "5", "6"]
+    assert content(run, "jobs", job) == content(run, "jobs", "a")
 
 
 @pytest.mark.parametrize(("workers", "distributed"), [(0, False), (2, False), (2, True)])
@@ -66,7 +78,7 @@ def test_stopped_and_resumed_equals_uninterrupted(tmp_path: Path, workers: int, 
     whole, stopped = fake_run(tmp_path / "whole"), fake_run(tmp_path / "stopped")
     run_jobs(whole, 0, ["waits_not"], distributed)
     iterations = stopped.directory.path / "waits.iterations"
-    engine = LocalEngine(workers, STAGES)
+    engine = LocalEngine(workers)
     outcome = engine.run_jobs(
         stage, stopped, ["waits", "later"], lambda event: None, lambda: len(lines(iterations)) >= 2
     )

@@ -1,17 +1,18 @@
 """The result does not depend on who computed it, nor on the reward of the environment."""
 
-import json
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
-from safetensors.numpy import load_file
 
-from oodil.pipeline.algorithms.weights import transferability
+import oodil
+from oodil.pipeline.algorithms.weights import transferability_of_logits
+from oodil.pipeline.artifacts import read_artifact
 from oodil.pipeline.environments.locomotion import HopperEnv
 from oodil.pipeline.loading import load_config
-from tests.runs import MICRO, artifacts, run
+from oodil.pipeline.results import ScoreHistory
+from tests.runs import MICRO, LiveRun, artifacts, run
 
 pytestmark = pytest.mark.timeout(600)
 NAIVE = "baselines=[naive_gail]"
@@ -35,11 +36,15 @@ def test_a_finished_run_is_reused_and_a_changed_field_recomputes_what_follows(in
     before = artifacts(inline)
     output = run("run", str(MICRO), NAIVE, "--run-dir", str(inline), "--workers", "0")
     assert output.count("reused") == len(before)
-    output = run("run", str(MICRO), NAIVE, "transferability.sharpening=1", "--run-dir", str(inline), "--workers", "0")
-    assert "transferability: recomputed: sharpening 4.0 -> 1.0" in output
+    changed = ("run", str(MICRO), NAIVE, "transferability.sharpening=1", "--run-dir", str(inline), "--workers", "0")
+    code, output = LiveRun(*changed).finish()
+    assert code == 2 and "finished with other settings (sharpening 4.0 -> 1.0); --force transferability" in output
+    assert artifacts(inline) == before, "nothing is replaced unasked, and the folder keeps its configuration"
+    output = run(*changed, "--force", "transferability")
+    assert "imitators: reused" in output and "transferability: recomputed: sharpening 4.0 -> 1.0" in output
     assert "imitation: recomputed: its input transferability changed" in output
     assert "clustering: reused" in output and "naive_gail: reused" in output
-    run("run", str(MICRO), NAIVE, "--run-dir", str(inline), "--workers", "0")
+    run("run", str(MICRO), NAIVE, "--run-dir", str(inline), "--workers", "0", "--force", "transferability")
     assert artifacts(inline) == before
 
 
@@ -63,46 +68,32 @@ class NanHopper(HopperEnv):
 
 def test_a_reward_of_nan_trains_to_the_same_bits(inline: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     gymnasium.register("oodil/NanHopper-v0", entry_point=NanHopper, max_episode_steps=1000)
-    from oodil.pipeline.artifacts import RunDirectory
-    from oodil.pipeline.stage import Run
-    from oodil.pipeline.stages import stages
-    from oodil.workers.engine import LocalEngine
-
     config = load_config(MICRO, [NAIVE, "environment.id=oodil/NanHopper-v0"])
-    poisoned = Run(config, RunDirectory(tmp_path / "run"))
-    sound = Run(load_config(MICRO, [NAIVE]), RunDirectory(inline))
-    from oodil.pipeline.artifacts import write_artifact
-
-    for stage in stages(config):
-        outcome = LocalEngine(0).run_jobs(stage, poisoned, stage.jobs(poisoned), lambda _: None, lambda: False)
-        assert not outcome.failed, outcome.failed
-        files = stage.combine(poisoned)
-        if files is not None:
-            write_artifact(poisoned.directory.stage(stage.name), stage.origin(poisoned), files)
+    poisoned = oodil.run(config, workers=0, run_dir=tmp_path / "run")
+    sound = oodil.open_run(inline)
     for stage_name, file in (
         ("transferability", "transferability.safetensors"),
         ("imitation", "policy.safetensors"),
         ("naive_gail", "policy.safetensors"),
     ):
         assert poisoned.artifact(stage_name).hashes[file] == sound.artifact(stage_name).hashes[file]
-    evaluation = poisoned.artifact("imitation").json("evaluation.json")
-    assert evaluation["final_return"] is None
+    assert np.isnan(poisoned.evaluation().mean_return)
 
 
 def test_a_second_training_leaves_the_first_alone_and_the_closest_counts(inline: Path) -> None:
     before = artifacts(inline)
-    run("run", str(MICRO), NAIVE, "transferability.num_trainings=2", "--run-dir", str(inline), "--workers", "0")
-    scores = load_file(inline / "stages" / "transferability" / "transferability.safetensors")["scores"]
+    again = ["transferability.num_trainings=2"]
+    results = oodil.run(
+        MICRO, [NAIVE, *again], workers=0, run_dir=inline, force=["imitators"], should_stop=lambda: False
+    )
     jobs = inline / "jobs" / "transferability"
-    every = [load_file(path / "scores.safetensors")["env_steps"][-1] for path in jobs.iterdir()]
-    summary = json.loads((inline / "stages" / "transferability" / "summary.json").read_text())
-    assert summary["env_steps"] == sum(every)
-    firsts = [path for path in jobs.iterdir() if "training" not in path.name]
+    readings = {path.name: ScoreHistory.load(read_artifact(path)) for path in jobs.iterdir()}
+    firsts = [name for name in readings if "training" not in name]
     assert firsts
     for first in firsts:
-        trained = [load_file(path / "scores.safetensors") for path in (first, jobs / f"{first.name}-training-2")]
-        last = [transferability(training["logits"][-1]) for training in trained]
+        both = [readings[first], readings[f"{first}-training-2"]]
+        last = [transferability_of_logits(reading.logits[-1]) for reading in both]
         assert not np.array_equal(*last), "both had the same luck"
-        assert np.array_equal(scores[trained[0]["demonstrations"]], max(last, key=np.mean))
-    run("run", str(MICRO), NAIVE, "--run-dir", str(inline), "--workers", "0")
+        assert np.array_equal(results.transferability.scores[both[0].demonstrations], max(last, key=np.mean))
+    oodil.run(MICRO, [NAIVE], workers=0, run_dir=inline, force=["imitators"])
     assert artifacts(inline) == before

@@ -16,9 +16,11 @@ from oodil.pipeline.collecting import InlineRollouts
 from oodil.pipeline.loading import load_config
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.stages import stages
-from oodil.workers.engine import Event, JobDone, JobFailed, JobProgress, JobStarted, LocalEngine, Outcome
+from oodil.workers.engine import Outcome
+from oodil.workers.local_engine import LocalEngine
 from oodil.workers.ray_engine import RayEngine, RayRollouts, connect
-from tests.fakes import STAGES, FakeStage, chain, fake_run, hopper_units, lines, wait_until
+from oodil.workers.reports import DONE, Event, Finished, Progress, Started
+from tests.fakes import FakeStage, chain, failures, fake_run, hopper_units, lines, wait_until
 from tests.flaky import FOLDER_VARIABLE
 from tests.runs import MICRO
 
@@ -60,40 +62,45 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
 def test_jobs_go_on_after_whatever_happens_to_them(tmp_path: Path, cluster: Cluster) -> None:
     """One raises in every attempt, one is killed once; neither ends the others, and the rest is as it is inline."""
     inline, on_ray = fake_run(tmp_path / "inline"), fake_run(tmp_path / "ray", max_attempts=3)
-    LocalEngine(0, STAGES).run_jobs(FakeStage(False), inline, ["a"], lambda event: None, lambda: False)
+    LocalEngine(0).run_jobs(FakeStage(False), inline, ["a"], lambda event: None, lambda: False)
     events: list[Event] = []
-    outcome = RayEngine(STAGES).run_jobs(
-        FakeStage(False), on_ray, ["a", "raises", "killed"], events.append, lambda: False
-    )
+    outcome = RayEngine().run_jobs(FakeStage(False), on_ray, ["a", "raises", "killed"], events.append, lambda: False)
     assert outcome.done == ["a", "killed"] and outcome.failed.keys() == {"raises"} and not outcome.stopped
     assert "ArithmeticError: told to, in attempt 1" in outcome.failed["raises"]
-    assert lines(on_ray.directory.path / "raises.began_at") == ["0", "2", "3"]
+    assert lines(on_ray.directory.path / "raises.began_at") == ["0", "2", "2"]
     assert lines(on_ray.directory.path / "killed.began_at") == ["0", "3"]
-    failures = [(e.job, e.attempt, e.will_retry) for e in events if isinstance(e, JobFailed)]
-    assert [f for f in failures if f[0] == "raises"] == [("raises", 1, True), ("raises", 2, True), ("raises", 3, False)]
-    assert [f for f in failures if f[0] == "killed"] == [("killed", 1, True)]
-    assert events.count(JobStarted("killed", 2)) == events.count(JobDone("killed")) == 1
+    failed = failures(events)
+    assert [f for f in failed if f[0] == "raises"] == [("raises", 1, True), ("raises", 2, True), ("raises", 3, False)]
+    assert [f for f in failed if f[0] == "killed"] == [("killed", 1, True)]
+    assert events.count(Event("killed", Started(2))) == events.count(Event("killed", Finished(DONE))) == 1
     expected = inline.job_artifact("jobs", "a").sha256
     assert {on_ray.job_artifact("jobs", job).sha256 for job in ("a", "killed")} == {expected}
     assert read_artifact(on_ray.directory.job("jobs", "raises")) is None
 
 
+def test_attempts_that_get_further_do_not_use_any_up(tmp_path: Path, cluster: Cluster) -> None:
+    run, events = fake_run(tmp_path, max_attempts=2), list[Event]()
+    outcome = RayEngine().run_jobs(FakeStage(False), run, ["killed_often"], events.append, lambda: False)
+    assert outcome == Outcome(done=["killed_often"])
+    assert failures(events) == [("killed_often", attempt, True) for attempt in range(1, 7)]
+
+
 def test_a_job_that_hangs_goes_on(tmp_path: Path, cluster: Cluster) -> None:
     inline, on_ray = fake_run(tmp_path / "inline"), fake_run(tmp_path / "ray", job_timeout_s=4)
-    LocalEngine(0, STAGES).run_jobs(FakeStage(False), inline, ["a"], lambda event: None, lambda: False)
+    LocalEngine(0).run_jobs(FakeStage(False), inline, ["a"], lambda event: None, lambda: False)
     events: list[Event] = []
-    outcome = RayEngine(STAGES).run_jobs(FakeStage(False), on_ray, ["hangs"], events.append, lambda: False)
+    outcome = RayEngine().run_jobs(FakeStage(False), on_ray, ["hangs"], events.append, lambda: False)
     assert outcome == Outcome(done=["hangs"])
-    assert [(e.attempt, e.will_retry) for e in events if isinstance(e, JobFailed)] == [(1, True)]
+    assert failures(events) == [("hangs", 1, True)]
     assert lines(on_ray.directory.path / "hangs.began_at") == ["0", "3"]
     assert on_ray.job_artifact("jobs", "hangs").sha256 == inline.job_artifact("jobs", "a").sha256
 
 
 def test_a_learner_on_ray_stops_and_goes_on(tmp_path: Path, cluster: Cluster) -> None:
     stage, whole, stopped = FakeStage(True), fake_run(tmp_path / "whole"), fake_run(tmp_path / "stopped")
-    LocalEngine(0, STAGES).run_jobs(stage, whole, ["a"], lambda event: None, lambda: False)
+    LocalEngine(0).run_jobs(stage, whole, ["a"], lambda event: None, lambda: False)
     noted = stopped.directory.path / "waits.iterations"
-    engine = RayEngine(STAGES)
+    engine = RayEngine()
     outcome = engine.run_jobs(stage, stopped, ["waits", "b"], lambda event: None, lambda: len(lines(noted)) >= 2)
     assert outcome.stopped and "waits" in outcome.not_run and not outcome.failed
     (stopped.directory.path / "go").touch()
@@ -165,5 +172,5 @@ def test_a_folder_that_a_node_does_not_see_is_refused(tmp_path: Path, cluster: C
         path.rmdir() if path.is_dir() else path.unlink()
     run.directory.path.rmdir()
     with pytest.raises(ValueError, match=r"does not see .*gone"):
-        RayEngine(STAGES).run_jobs(FakeStage(False), run, ["a"], events.append, lambda: False)
-    assert not [event for event in events if isinstance(event, JobProgress)]
+        RayEngine().run_jobs(FakeStage(False), run, ["a"], events.append, lambda: False)
+    assert not [event for event in events if isinstance(event.report, Progress)]

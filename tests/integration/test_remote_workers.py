@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 from oodil.cli import app
 from oodil.pipeline.stage import Run
 from oodil.workers.channels import Access, Dealer, Router, new_key_pair
-from oodil.workers.engine import LocalEngine
 from oodil.workers.keys import KeysError, client_keys, create_learner_keys, create_worker_keys, server_keys
+from oodil.workers.local_engine import LocalEngine
 from oodil.workers.messages import Header, Ready, encode
-from tests.fakes import STAGES, FakeStage, fake_run, lines
+from tests.fakes import FakeStage, fake_run, lines
 from tests.runs import ROOT
 
 pytestmark = pytest.mark.timeout(120)
@@ -102,7 +102,7 @@ def test_a_worker_that_joins_from_elsewhere_changes_no_bit(access: Access, tmp_p
     """The job waits in its third iteration until the remote worker has collected, or is gone."""
     alone = fake_run(tmp_path / "alone")
     (alone.directory.path / "go").touch()
-    expected = finished(alone, LocalEngine(1, STAGES))
+    expected = finished(alone, LocalEngine(1))
 
     keys = create_worker_keys(access.keys, "elsewhere", new_key_pair)
     remote = remote_worker(access, keys, tmp_path / "logs")
@@ -118,7 +118,7 @@ def test_a_worker_that_joins_from_elsewhere_changes_no_bit(access: Access, tmp_p
         return False
 
     stage = FakeStage(distributed=True)
-    outcome = LocalEngine(1, STAGES, access).run_jobs(stage, joined, ["waits"], lambda _: None, go)
+    outcome = LocalEngine(1, access).run_jobs(stage, joined, ["waits"], lambda _: None, go)
     assert outcome.done == ["waits"], outcome
     assert joined.job_artifact("learner", "waits").sha256 == expected
     if not leaves:

@@ -15,8 +15,12 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from oodil.pipeline.evaluation import film
-from oodil.pipeline.experts import load_expert
-policy, _ = load_expert(Path("configs/experts/hopper-gravity-9.8"))
+from oodil.pipeline.environments import environment_spec
+from oodil.pipeline.results import Policy
+from oodil.pipeline.stages.experts import load_expert
+expert, _ = load_expert(Path("configs/experts/hopper-gravity-9.8"))
+spec = environment_spec("oodil/Hopper-v0", {})
+policy = Policy(expert, "oodil/Hopper-v0", spec.observation_shape, spec.action_low, spec.action_high)
 print(film(policy, "oodil/Hopper-v0", {"gravity": 9.8}, 0, Path(sys.argv[1])))
 """
 

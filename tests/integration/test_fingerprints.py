@@ -1,0 +1,112 @@
+"""What is computed again, and what is not: each field of the configuration that changes a result, and no other."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import oodil
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.stage import Run
+from tests.runs import MICRO
+
+pytestmark = pytest.mark.timeout(300)
+BASELINES = "baselines=[naive_gail, oracle]"
+
+IRRELEVANT = [
+    "demonstrations.sources.0.label=renamed",
+    "demonstrations.sources.1.label='12'",
+    "demonstrations.sources.0.expert_discount=0.9",
+    "evaluation.num_points=7",
+    "evaluation.episodes=9",
+    "evaluation.final_episodes=99",
+    "evaluation.num_scores=3",
+    "runtime.workers=7",
+    "runtime.checkpoint_interval_s=99",
+    "runtime.unit_timeout_s=9",
+    "runtime.job_timeout_s=99",
+    "runtime.max_attempts=9",
+    "runtime.max_worker_restarts=9",
+    "runtime.restart_delay_s=9",
+]
+MARKS = "demonstrations.sources.1.transferable=true"
+RELEVANT = {
+    "demonstrations.sources.0.count=4": ("demonstrations", "sources[0].count 3 -> 4"),
+    "demonstrations.sources.0.dynamics.gravity=9.9": ("demonstrations", "sources[0].dynamics.gravity 9.8 -> 9.9"),
+    "demonstrations.deterministic=true": ("demonstrations", "deterministic False -> True"),
+    "clustering.temperature=0.5": ("clustering", "temperature 1.0 -> 0.5"),
+    "transferability.num_trainings=2": ("imitators", "num_trainings 1 -> 2"),
+    "transferability.gail.lag=0": ("imitators", "gail.lag 1 -> 0"),
+    "transferability.final_steps=11": ("transferability", "final_steps 10 -> 11"),
+    "transferability.sharpening=1": ("transferability", "sharpening 4.0 -> 1.0"),
+    "imitation.gail.discount=0.9": ("imitation", "gail.discount 0.995 -> 0.9"),
+    MARKS: ("marks", "transferable[1] False -> True"),
+}
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run."""
+    path = tmp_path_factory.mktemp("fingerprints") / "run"
+    oodil.run(MICRO, [BASELINES], workers=0, run_dir=path)
+    return path
+
+
+def states(run_dir: Path, override: str) -> dict[str, tuple[str, str]]:
+    """Return where each stage of a finished run would stand under a changed configuration."""
+    config = oodil.load_config(MICRO, [BASELINES, override])
+    opened = oodil.open_run(run_dir)
+    changed = oodil.RunResults(Run(config, opened.run.directory))
+    return {name: (state.state, state.reason) for name, state in changed.states.items()}
+
+
+@pytest.mark.parametrize("override", IRRELEVANT)
+def test_what_is_only_reported_or_only_speed_computes_nothing_again(run_dir: Path, override: str) -> None:
+    assert {state for state, _ in states(run_dir, override).values()} == {"done"}, override
+
+
+@pytest.mark.parametrize("override", RELEVANT)
+def test_what_changes_a_result_makes_its_stage_stale_and_names_the_field(run_dir: Path, override: str) -> None:
+    stage, reason = RELEVANT[override]
+    found = states(run_dir, override)
+    assert found[stage] == ("stale", reason)
+    order = list(found)
+    assert all(found[name][0] == "done" for name in order[: order.index(stage)])
+
+
+def test_a_mark_touches_the_oracle_alone(run_dir: Path) -> None:
+    stale = {name for name, (state, _) in states(run_dir, MARKS).items() if state == "stale"}
+    assert stale == {"marks", "oracle"}
+
+
+def fields(section: type, prefix: str = "") -> Iterator[str]:
+    """Yield the path of every field below a section that is not a section itself."""
+    for name, field in section.model_fields.items():
+        if isinstance(field.annotation, type) and hasattr(field.annotation, "model_fields"):
+            yield from fields(field.annotation, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}"
+
+
+def test_no_field_of_evaluation_or_runtime_is_forgotten() -> None:
+    listed = {override.partition("=")[0] for override in IRRELEVANT}
+    found = {field for field in fields(RunConfig) if field.split(".")[0] in ("evaluation", "runtime")}
+    assert found == {field for field in listed if field.split(".")[0] in ("evaluation", "runtime")}
+
+
+def test_a_stale_stage_is_shown_and_not_used(run_dir: Path) -> None:
+    config = oodil.load_config(MICRO, [BASELINES, "transferability.sharpening=1"])
+    results = oodil.RunResults(Run(config, oodil.open_run(run_dir).run.directory))
+    described = results.describe()["stages"]
+    assert described["transferability"] == described["transferability"] | {
+        "state": "stale",
+        "reason": "sharpening 4.0 -> 1.0",
+        "sha256": None,
+    }
+    assert described["imitation"]["state"] == "stale"
+    assert described["imitation"]["reason"] == "its input transferability is stale"
+    for use in (lambda: results.transferability, results.policy, results.evaluation):
+        with pytest.raises(oodil.OodilError, match="is stale"):
+            use()
+    assert results.policy("naive_gail")
+    assert "imitation" not in results.summary()["policies"]

@@ -1,0 +1,68 @@
+"""A method that somebody registers runs, and appears wherever methods are shown, without a line of ours."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import oodil
+import tests.toy  # noqa: F401 (registers the policy `far` and its weighting)
+from oodil.cli import app
+from oodil.pipeline.stages.weighting import CannotScoreError
+from tests.runs import MICRO
+
+pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run with a policy of ours, a foreign one and the oracle, each job in a process of its own."""
+    path = tmp_path_factory.mktemp("toy") / "run"
+    oodil.run(MICRO, ["baselines=[far, oracle]"], workers=1, run_dir=path)
+    return path
+
+
+def shown(*arguments: str) -> str:
+    result = CliRunner().invoke(app, list(arguments))
+    assert result.exit_code == 0, (result.output, result.exception)
+    return result.output
+
+
+def test_it_appears_in_status_evaluate_and_report(run_dir: Path) -> None:
+    described = json.loads(shown("status", str(run_dir), "--json"))
+    assert {"distance", "far"} < described["stages"].keys()
+    assert all(stage["state"] == "done" for stage in described["stages"].values())
+    assert {"imitation", "far", "oracle"} == described["results"]["policies"].keys()
+    assert {"transferability", "distance", "marks"} == described["results"]["weightings"].keys()
+    assert "final return, far ones" in shown("status", str(run_dir))
+    assert "far: return" in shown("evaluate", str(run_dir), "--episodes", "2")
+    page = Path(shown("report", str(run_dir)).strip()).read_text()
+    assert "far ones" in page and "distance" in page
+
+
+def test_its_weights_are_what_the_policy_learned_from_and_it_scores_others(run_dir: Path) -> None:
+    results = oodil.open_run(run_dir)
+    demonstrations, held = results.demonstrations, results.weighting("distance")
+    again = results.score(demonstrations, "distance")
+    np.testing.assert_array_equal(again.scores, held.scores)
+    assert results.policy("far").gaussian.weights[0].tobytes() != results.policy().gaussian.weights[0].tobytes()
+    with pytest.raises(CannotScoreError, match="marks say nothing"):
+        results.score(demonstrations, "marks")
+
+
+def test_frozen_models_say_of_the_runs_own_demonstrations_what_the_run_said(run_dir: Path) -> None:
+    results = oodil.open_run(run_dir)
+    again = results.score(results.demonstrations)
+    np.testing.assert_array_equal(again.clusters, results.transferability.clusters)
+    np.testing.assert_allclose(again.scores, results.transferability.scores, rtol=1e-5)
+    one = results.score(results.demonstrations.select(np.array([2])))
+    np.testing.assert_allclose(one.weights, [1.0])
+
+
+def test_what_is_not_known_is_named(run_dir: Path, tmp_path: Path) -> None:
+    with pytest.raises(oodil.OodilError, match="no policy 'transferability'; there are imitation"):
+        oodil.load_config(MICRO, ["baselines=[transferability]"])
+    with pytest.raises(oodil.OodilError, match="no stage 'naive_gail'; this run has"):
+        oodil.open_run(run_dir).policy("naive_gail")
