@@ -36,7 +36,7 @@ test: check
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 docs: $(VENV)/docs
-	$(BIN)/python -m sphinx -W --keep-going -q -c docs . build/docs
+	$(BIN)/python -m sphinx -W --keep-going -E -q -c docs . build/docs
 	@echo "build/docs/index.html"
 
 $(VENV)/docs: $(VENV)/installed
