@@ -28,6 +28,7 @@ autodoc_typehints_format = "short"
 autodoc_default_options = {"members": True}
 napoleon_numpy_docstring = False
 
+highlight_language = "text"
 html_theme = "furo"
 html_title = f"oodil {release}"
 html_copy_source = False
