@@ -1,10 +1,10 @@
-# make install | quickstart | test: each prepares what it needs and can be repeated.
+# make install | quickstart | unit | test | docs: each prepares what it needs and can be repeated.
 PYTHON ?= python3
 PIP_ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install quickstart smoke unit test check clean
+.PHONY: install quickstart smoke unit test check docs clean
 install: $(VENV)/installed
 
 $(VENV)/installed: pyproject.toml constraints.txt
@@ -34,6 +34,14 @@ unit: install
 
 test: check
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+docs: $(VENV)/docs
+	$(BIN)/python -m sphinx -W --keep-going -E -q -c docs . build/docs
+	@echo "build/docs/index.html"
+
+$(VENV)/docs: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint constraints.txt --editable ".[docs]"
+	@touch $@
 
 clean:
 	rm -rf $(VENV) runs build *.egg-info
