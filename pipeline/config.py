@@ -355,7 +355,8 @@ class RunConfig(_Section):
     imitation: ImitationConfig
     """The final policy."""
     baselines: tuple[str, ...] = ()
-    """Policies that are trained beside it for comparison, by their names in the registry (`naive_gail`, `oracle`)."""
+    """Policies that are trained beside it for comparison: `naive_gail`, `oracle`, or `module:name` for one that a module
+    of yours registers."""
     evaluation: EvaluationConfig = EvaluationConfig()
     """What is measured beside the training."""
     runtime: RuntimeConfig = RuntimeConfig()

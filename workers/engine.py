@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from oodil.pipeline.config import RuntimeConfig
+from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.stage import Run, Stage
 from oodil.workers.reports import DONE, AttemptFailed, Event, Finished, Progress, Report, Started
 
@@ -42,6 +43,14 @@ class Engine(Protocol):
         Once ``should_stop`` returns true, running jobs write a checkpoint and stop. ``on_event`` is called in this
         thread.
         """
+
+
+def refuse_main(stage: Stage) -> None:
+    """Raise ConfigError for a stage that no other process can import, because the caller's script defines it."""
+    if stage.module == "__main__":
+        raise ConfigError(
+            f"{stage.name} is defined in the script that runs; put it into a module of its own, or use workers=0"
+        )
 
 
 class Attempts:

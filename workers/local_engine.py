@@ -14,7 +14,7 @@ from oodil.pipeline.stage import Run, Stage
 from oodil.workers import job as job_process
 from oodil.workers import rollout_worker
 from oodil.workers.channels import Access, private_endpoint
-from oodil.workers.engine import POLL_S, Attempts, JobLedger, OnEvent, Outcome, ShouldStop
+from oodil.workers.engine import POLL_S, Attempts, JobLedger, OnEvent, Outcome, ShouldStop, refuse_main
 from oodil.workers.reports import Event, Failed, Finished, Progress, Replaced, Silent, Started, Warn
 from oodil.workers.supervisor import Supervisor
 
@@ -54,6 +54,7 @@ class LocalEngine:
         if not self._workers:
             _run_inline(stage, run, jobs, ledger, should_stop)
             return ledger.outcome()
+        refuse_main(stage)
         with (
             private_endpoint(run.directory.path) if stage.distributed else nullcontext("") as endpoint,
             Supervisor(run.directory.logs(), stage.name, _PRELOAD) as supervisor,

@@ -26,7 +26,7 @@ from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.stage import Run, Stage
 from oodil.pipeline.versions import collecting_versions
 from oodil.workers import job as job_process
-from oodil.workers.engine import POLL_S, JobLedger, OnEvent, Outcome, ShouldStop
+from oodil.workers.engine import POLL_S, JobLedger, OnEvent, Outcome, ShouldStop, refuse_main
 from oodil.workers.messages import Header, ResultMessage, UnitMessage, decode, encode
 from oodil.workers.reports import STOPPED, Failed, Finished, Report, decode_report, encode_report
 from oodil.workers.wire import MessageError, shortened
@@ -83,6 +83,7 @@ class RayEngine:
 
         Raises ConfigError when a node does not see the run's folder or has other libraries.
         """
+        refuse_main(stage)
         path = str(run.directory.path.absolute())
         _check_nodes(path)
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)

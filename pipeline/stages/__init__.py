@@ -4,6 +4,8 @@ Importing this package registers them. A stage loads what it computes with insid
 starting one, does not wait for torch.
 """
 
+import importlib
+
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.stage import Stage, registered, stage_named
@@ -37,8 +39,14 @@ def stages(config: RunConfig) -> list[Stage]:
             add(needed)
         found.setdefault(name, stage)
 
-    known = [stage.name for stage in registered() if isinstance(stage, PolicyStage)]
-    for name in ("imitation", *config.baselines):
+    for entry in ("imitation", *config.baselines):
+        module, _, name = entry.rpartition(":")
+        if module:
+            try:
+                importlib.import_module(module)
+            except ModuleNotFoundError as error:
+                raise ConfigError(f"baselines: {entry!r} cannot be loaded: {error}") from error
+        known = [stage.name for stage in registered() if isinstance(stage, PolicyStage)]
         if name not in known:
             raise ConfigError(f"baselines: no policy {name!r}; there are {', '.join(known)}")
         add(name)

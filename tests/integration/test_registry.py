@@ -1,6 +1,8 @@
 """A method that somebody registers runs, and appears wherever methods are shown, without a line of ours."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 import oodil
-import tests.toy  # noqa: F401 (registers the policy `far` and its weighting)
 from oodil.cli import app
 from oodil.pipeline.stages.weighting import CannotScoreError
-from tests.runs import MICRO
+from tests.runs import MICRO, ROOT
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -20,7 +21,7 @@ pytestmark = pytest.mark.timeout(300)
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run with a policy of ours, a foreign one and the oracle, each job in a process of its own."""
     path = tmp_path_factory.mktemp("toy") / "run"
-    oodil.run(MICRO, ["baselines=[far, oracle]"], workers=1, run_dir=path)
+    oodil.run(MICRO, ["baselines=[tests.toy:far, oracle]"], workers=1, run_dir=path)
     return path
 
 
@@ -62,7 +63,24 @@ def test_frozen_models_say_of_the_runs_own_demonstrations_what_the_run_said(run_
 
 
 def test_what_is_not_known_is_named(run_dir: Path, tmp_path: Path) -> None:
+    with pytest.raises(oodil.OodilError, match="'tests.toi:far' cannot be loaded: No module named 'tests.toi'"):
+        oodil.load_config(MICRO, ["baselines=['tests.toi:far']"])
     with pytest.raises(oodil.OodilError, match="no policy 'transferability'; there are imitation"):
         oodil.load_config(MICRO, ["baselines=[transferability]"])
     with pytest.raises(oodil.OodilError, match="no stage 'naive_gail'; this run has"):
         oodil.open_run(run_dir).policy("naive_gail")
+
+
+def test_a_method_of_the_running_script_says_that_workers_cannot_import_it(tmp_path: Path) -> None:
+    program = (
+        "import oodil, sys\n"
+        "from tests.toy import Distance\n"
+        "class Mine(Distance): name = 'mine'\n"
+        "oodil.register(Mine())\n"
+        "oodil.register(oodil.PolicyStage('near', title='near', weighting='mine'))\n"
+        "oodil.run(sys.argv[1], ['baselines=[near]', 'imitation.gail.total_steps=1'], workers=1, run_dir=sys.argv[2])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(MICRO), str(tmp_path / "run")], cwd=ROOT, capture_output=True, text=True
+    )
+    assert "mine is defined in the script that runs; put it into a module of its own, or use workers=0" in done.stderr

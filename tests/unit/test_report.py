@@ -18,6 +18,7 @@ from oodil.pipeline import stage as stage_module
 from oodil.pipeline.artifacts import Files, RunDirectory, write_artifact
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations, Episode
+from oodil.pipeline.errors import StorageError
 from oodil.pipeline.loading import parse_config
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.report import Report, context, summary, write_report
@@ -660,7 +661,7 @@ def test_a_failed_write_leaves_the_old_report(tmp_path: Path, monkeypatch: pytes
 
     with monkeypatch.context() as patch:
         patch.setattr("os.replace", full_disk)
-        with pytest.raises(OSError, match="No space"):
+        with pytest.raises(StorageError, match="No space"):
             write_report(run)
     assert path.read_bytes() == before
 
