@@ -1,7 +1,7 @@
 """Whether any process of a run grows: the learner loop with two rollout workers for an hour, watched from outside.
 
-Prints the resident memory of every process each minute, and at the end how much each grew since the warm-up. Run
-``python benchmarks/soak.py --json FILE``.
+Prints the resident memory of every process each minute, and at the end how much each grew since the warm-up. What
+the fork server has loaded is shared, and counts for each. Run ``python benchmarks/soak.py --json FILE``.
 """
 
 import subprocess
@@ -31,9 +31,9 @@ def resident_megabytes(root: psutil.Process) -> dict[str, float]:
 
 
 def role(process: psutil.Process) -> str:
-    """Return what a child is, by the log it writes; multiprocessing's own helper has none."""
+    """Return what a child is, by the log it writes; the fork server has none."""
     logs = [Path(file.path).name for file in process.open_files() if "/logs/" in file.path]
-    return logs[0].rsplit(".", 2)[0] if logs else "resource tracker"
+    return logs[0].rsplit(".", 2)[0] if logs else "fork server"
 
 
 def growth(minutes: list[float], megabytes: list[float]) -> float:
