@@ -115,6 +115,9 @@ def train(
 ) -> History:
     """Train until the budget is spent, from the newest checkpoint if there is one.
 
+    After each iteration the context learns the metrics of `Learner.update` and the mean ``return`` and ``length`` of
+    the last hundred episodes of training, as soon as one has ended.
+
     Raises JobStoppedError, after writing a checkpoint, when the context asks for a stop.
     """
     torch.set_num_threads(config.torch_threads)
@@ -144,7 +147,7 @@ def train(
             position.policy, position.policy_version = learner.behavior_policy(), position.iteration
             if not is_last:
                 context.rollouts.submit([unit(group) for group in range(config.num_groups)])
-        _refuse_divergence(learner, metrics, iteration)
+        _refuse_divergence(metrics, iteration)
 
         env_steps = position.iteration * config.steps_per_iteration
         for probe in probes:
@@ -203,7 +206,7 @@ class _Recent:
         return {name: float(np.mean(self._values))} if self._values else {}
 
 
-def _refuse_divergence(learner: Learner, metrics: dict[str, float], iteration: int) -> None:
+def _refuse_divergence(metrics: dict[str, float], iteration: int) -> None:
     broken = [name for name, value in metrics.items() if not np.isfinite(value)]
     if broken:
         raise FloatingPointError(f"training diverged in iteration {iteration}: {', '.join(broken)} not finite")

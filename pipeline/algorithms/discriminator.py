@@ -20,9 +20,9 @@ from oodil.pipeline.config import DiscriminatorConfig
 from oodil.pipeline.data import Demonstrations, offsets_of
 
 
-def discriminator_loss(demonstration_logits: Tensor, policy_logits: Tensor) -> Tensor:
-    """Return -E_demo log D - E_policy log(1 - D), each term averaged, for (M,) and (B,) logits."""
-    return softplus(-demonstration_logits).mean() + softplus(policy_logits).mean()
+def discriminator_losses(demonstration_logits: Tensor, policy_logits: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the two terms of the loss, -E_demo log D and -E_policy log(1 - D), for (M,) and (B,) logits."""
+    return softplus(-demonstration_logits).mean(), softplus(policy_logits).mean()
 
 
 def imitation_reward(logits_expert_is_high: Tensor, kind: Literal["positive", "logit"]) -> Tensor:
@@ -59,13 +59,19 @@ class Discriminator(nn.Module):
         return torch.from_numpy(np.concatenate((states, successors), axis=1))
 
     def update(self, demonstration_pairs: Tensor, policy_pairs: Tensor) -> dict[str, float]:
-        """Take one full-batch step on (M, 2S) demonstration pairs against (B, 2S) policy pairs."""
+        """Take one full-batch step on (M, 2S) demonstration pairs against (B, 2S) policy pairs.
+
+        Returns metrics of the discriminator as it was before: its loss, and loss and accuracy on either side.
+        """
         count = len(demonstration_pairs)
         logits = self(torch.cat((demonstration_pairs, policy_pairs)))
-        loss = discriminator_loss(logits[:count], logits[count:])
+        demonstration_loss, policy_loss = discriminator_losses(logits[:count], logits[count:])
+        loss = demonstration_loss + policy_loss
         self.optimizer.step(loss)
         return {
             "discriminator_loss": float(loss.detach()),
+            "discriminator_demonstration_loss": float(demonstration_loss.detach()),
+            "discriminator_policy_loss": float(policy_loss.detach()),
             "demonstration_accuracy": float((logits[:count] > 0).float().mean()),
             "policy_accuracy": float((logits[count:] < 0).float().mean()),
         }

@@ -99,7 +99,18 @@ class Learner(Generic[Reward]):
         return self.policy.export()
 
     def update(self, batch: TransitionBatch, iteration: int) -> dict[str, float]:
-        """Learn from one iteration's batch and return metrics."""
+        """Learn from one iteration's batch.
+
+        Returns metrics, by names that do not change:
+            reward: mean of the rewards that the policy learned from.
+            policy_lag: updates since the policy that collected the batch, 0 or 1.
+            kl: divergence from the policy before the update, in nats per state.
+            entropy: of the new policy, in nats.
+            value_loss: mean squared error in the last minibatch.
+            improvement, step_fraction: of TRPO alone, see `Trpo.update`.
+            discriminator_loss, discriminator_demonstration_loss, discriminator_policy_loss, demonstration_accuracy,
+            policy_accuracy: of imitators alone, see `Discriminator.update`.
+        """
         config = self.config
         step_scale = 1 - iteration / config.num_iterations if config.anneal else 1.0
         rng = torch.Generator().manual_seed(torch_seed(derive_key(self.root_seed, "learner", iteration)))
@@ -113,7 +124,7 @@ class Learner(Generic[Reward]):
         advantages = generalized_advantages(
             rewards, values, next_values, batch.terminated, batch.truncated, config.discount, config.gae_lambda
         )
-        metrics = {"reward": float(rewards.mean())}
+        metrics = {"reward": float(rewards.mean()), "policy_lag": float(iteration - batch.policy_version)}
         metrics |= self.policy_optimizer.update(
             observations,
             torch.from_numpy(batch.actions).flatten(0, 1),
