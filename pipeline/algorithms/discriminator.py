@@ -28,7 +28,7 @@ def discriminator_losses(demonstration_logits: Tensor, policy_logits: Tensor) ->
 def imitation_reward(logits_expert_is_high: Tensor, kind: Literal["positive", "logit"]) -> Tensor:
     """Return (B,) rewards, large where a pair looks like a demonstration.
 
-    ``positive`` is -log(1 - D), the reward of GAIL. It also pays for going on; see docs/algorithms.md. ``logit`` is
+    ``positive`` is -log(1 - D), the reward of GAIL, which also rewards survival; see docs/algorithms.md. ``logit`` is
     log D - log(1 - D), the logit itself, the reward of AIRL (Fu et al. 2018, https://arxiv.org/abs/1710.11248).
     """
     return softplus(logits_expert_is_high) if kind == "positive" else logits_expert_is_high
@@ -45,7 +45,7 @@ class Discriminator(nn.Module):
         self.restart_optimizer()
 
     def restart_optimizer(self) -> None:
-        """Begin with fresh moments, at the configured learning rate."""
+        """Reset the optimizer's moments and learning rate."""
         self.optimizer = Adam(list(self.parameters()), self.config.learning_rate)
 
     def forward(self, pairs: Tensor) -> Tensor:
@@ -53,7 +53,7 @@ class Discriminator(nn.Module):
         return self.net(pairs).squeeze(-1)
 
     def pairs(self, states: NDArray[np.float32], successors: NDArray[np.float32]) -> Tensor:
-        """Return (B, 2S) from (B, S) states and their successors, without the dimensions that are ignored."""
+        """Return (B, 2S) inputs from (B, S) states and their successors, without the ignored dimensions."""
         if self.config.ignored:
             states, successors = states[:, self._seen], successors[:, self._seen]
         return torch.from_numpy(np.concatenate((states, successors), axis=1))
