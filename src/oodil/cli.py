@@ -339,7 +339,7 @@ def export_demos(
     from oodil.pipeline.datasets.export import export
 
     results = open_run(run_dir)
-    print(export(results.demonstrations, results.transferability, target))
+    print(export(results.demonstrations, results.transferability.columns(), target))
 
 
 def _engine(
