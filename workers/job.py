@@ -13,6 +13,7 @@ from oodil.pipeline.versions import library_versions
 from oodil.workers.channels import Access
 from oodil.workers.reports import DONE, STOPPED, Progress, Report, Silent, Warn
 from oodil.workers.supervisor import Link
+from oodil.workers.threads import one_thread
 from oodil.workers.wire import shortened
 
 _REPORT_INTERVAL_S = 0.2
@@ -56,13 +57,15 @@ def run_job(
     send: Callable[[Report], None],
     should_stop: Callable[[], bool],
 ) -> str:
-    """Run a job in this process and write its artifact; its checkpoints go when that is safe on disk.
+    """Run a job in this process, with one compute thread, and write its artifact.
 
+    Its checkpoints are deleted when that is safe on disk.
     Returns DONE, or STOPPED when it stopped because ``should_stop`` returned true. Raises what the job raises.
     """
     context = Context(rollouts, run.config.runtime.checkpoint_interval_s, send, should_stop)
     try:
-        files = stage.run_job(run, job, context)
+        with one_thread():
+            files = stage.run_job(run, job, context)
     except JobStoppedError:
         return STOPPED
     write_artifact(run.directory.job(stage.name, job), stage.job_origin(run, job), files, library_versions())
