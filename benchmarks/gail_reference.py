@@ -23,6 +23,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np  # noqa: E402
+from oodil.pipeline.experts import collect_demonstrations, load_expert  # noqa: E402
 
 from benchmarks.throughput import machine  # noqa: E402
 from oodil.pipeline.algorithms.gail import AdversarialReward  # noqa: E402
@@ -31,7 +32,6 @@ from oodil.pipeline.artifacts import Checkpoints  # noqa: E402
 from oodil.pipeline.collecting import InlineRollouts  # noqa: E402
 from oodil.pipeline.config import EnvironmentConfig, GailConfig  # noqa: E402
 from oodil.pipeline.evaluation import evaluate  # noqa: E402
-from oodil.pipeline.experts import collect_demonstrations, load_expert  # noqa: E402
 from oodil.pipeline.seeding import derive_key  # noqa: E402
 from oodil.pipeline.training import Probe, train  # noqa: E402
 from oodil.pipeline.versions import library_versions  # noqa: E402

@@ -21,12 +21,12 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from oodil.pipeline.experts import hand_written
 
 from benchmarks.throughput import machine
 from oodil.pipeline.environments import make_batch, panda
 from oodil.pipeline.environments.panda import ALL_JOINTS, BOX_START, TIME_STEP, Arm, Floats
 from oodil.pipeline.evaluation import run_episodes
-from oodil.pipeline.experts import hand_written
 from oodil.pipeline.seeding import numpy_rng
 from oodil.pipeline.versions import library_versions
 
