@@ -4,6 +4,12 @@ Stages say what is computed, an engine says where; here it is only decided what 
 no signal is handled here: an observer is told what happens, and a function is asked whether to stop.
 """
 
+# First of all: ``python orchestrator.py`` is the command line, which loads what a command needs by itself.
+if __name__ == "__main__":
+    from oodil.cli import main
+
+    main()
+
 import fcntl
 import json
 import time
@@ -244,9 +250,3 @@ def _record(directory: RunDirectory, event: str, **fields: Any) -> None:
 
 def _short(value: Any) -> str:
     return json.dumps(value.model_dump() if hasattr(value, "model_dump") else value)
-
-
-if __name__ == "__main__":
-    from oodil.cli import main
-
-    main()
