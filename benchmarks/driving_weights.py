@@ -8,32 +8,34 @@ Letters: N demonstrations, P states of all of them.
 """
 
 import argparse
-import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from common import one_thread
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
-from sklearn.metrics import roc_auc_score
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from oodil.orchestrator import read_run
+import oodil
 from oodil.pipeline.algorithms.weights import sampling_mass
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import make_batch
-from oodil.pipeline.environments.driving import GOAL, HEIGHT, STEP_REWARD, WIDTH, Layout, layout, touches
+from oodil.pipeline.environments.driving import GOAL, HEIGHT, STEP_REWARD, WIDTH, DrivingEnv, Layout, touches
 from oodil.pipeline.evaluation import run_episodes
-from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.results import Transferability
+from oodil.pipeline.runs import RunResults, separation_metrics
 from oodil.pipeline.seeding import derive_key, numpy_rng
-from oodil.pipeline.stage import Run
-from oodil.pipeline.stages.demonstrations import load_demonstrations
 
-POLICIES = {"imitation": "ours", "naive_gail": "naive GAIL", "oracle": "oracle"}
+
+def world_of(dynamics: Mapping[str, float]) -> Layout:
+    """Return the world that an environment with these dynamics has."""
+    keywords: dict[str, Any] = dict(dynamics)
+    return DrivingEnv(**keywords).layout
 
 
 def positions(demonstrations: Demonstrations) -> NDArray[np.float64]:
@@ -70,13 +72,14 @@ def draw(demonstrations: Demonstrations, scores: NDArray[np.float64], world: Lay
     return figure
 
 
-def judge(run: Run, demonstrations: Demonstrations, world: Layout, scores: NDArray, weights: NDArray) -> list[str]:
+def judge(results: RunResults, demonstrations: Demonstrations, world: Layout, found: Transferability) -> list[str]:
     """Print what the scores make of paths that can be reproduced and of others; return a title for each source."""
-    sources = run.config.demonstrations.sources
+    sources = results.config.demonstrations.sources
     clear = is_clear(demonstrations, world)
-    at_its_speed = np.array([source.dynamics["speed"] == world.speed for source in sources])
+    at_its_speed = np.array([world_of(source.dynamics).speed == world.speed for source in sources])
     reproducible = clear & at_its_speed[demonstrations.sources]
-    before, plain, after = (sampling_mass(each, demonstrations) for each in (np.ones_like(weights), scores, weights))
+    scores, uniform = found.scores, np.ones(len(demonstrations))
+    before, plain, after = (sampling_mass(each, demonstrations) for each in (uniform, scores, found.weights))
 
     def shares(some: NDArray[np.bool_]) -> str:
         return f"sampling mass {before[some].sum():.1%}, plain {plain[some].sum():.1%}, as used {after[some].sum():.1%}"
@@ -89,17 +92,18 @@ def judge(run: Run, demonstrations: Demonstrations, world: Layout, scores: NDArr
             if some.any():
                 spread = f"{scores[some].mean():.3g} ({scores[some].min():.3g} to {scores[some].max():.3g})"
                 print(f"{source.label}, {kind}: {some.sum()}, score {spread}, {shares(some)}")
-    auroc = roc_auc_score(reproducible, scores)
+    both = 0 < reproducible.sum() < len(reproducible)
+    auroc = separation_metrics(reproducible, scores, found.weights, demonstrations)["auroc"] if both else np.nan
     print(f"reproducible: {reproducible.sum()} of {len(reproducible)}, AUROC {auroc:.3f}, {shares(reproducible)}")
     return titles
 
 
-def drive(run: Run, stage: str, num_episodes: int) -> str:
-    """Return what a stage's policy does in fresh episodes, also by the third of the start line that they begin in."""
-    environment = run.config.environment
-    policy = GaussianPolicy.from_arrays(run.artifact(stage).arrays("policy.safetensors"))
+def drive(results: RunResults, policy: str, num_episodes: int) -> str:
+    """Return what a policy does in fresh episodes, also by the third of the start line that they begin in."""
+    environment = results.config.environment
     cars = make_batch(environment.id, environment.dynamics, num_episodes)
-    episodes = run_episodes(cars, policy, numpy_rng(derive_key(run.config.seed, "benchmark")), stochastic=False)
+    rng = numpy_rng(derive_key(results.config.seed, "benchmark"))
+    episodes = run_episodes(cars, results.policy(policy).gaussian, rng, stochastic=False)
     returns = np.array([episode.env_return for episode in episodes])
     steps = np.array([len(episode.states) - 1 for episode in episodes])
     third = np.array([(episode.states[0, 0] / 2 + 0.5) * WIDTH // 25 for episode in episodes])
@@ -109,20 +113,21 @@ def drive(run: Run, stage: str, num_episodes: int) -> str:
 
 
 def main() -> None:
+    one_thread()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run_dir", type=Path)
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--episodes", type=int, default=300)
     arguments = parser.parse_args()
-    run = read_run(arguments.run_dir)
-    demonstrations = load_demonstrations(run)
-    world = layout(**run.config.environment.dynamics)
-    results = run.artifact("transferability").arrays("transferability.safetensors")
-    titles = judge(run, demonstrations, world, results["scores"], results["weights"])
-    for stage, name in POLICIES.items():
-        print(f"{name}: {drive(run, stage, arguments.episodes)}")
+    results = oodil.open_run(arguments.run_dir)
+    demonstrations, found = results.demonstrations, results.transferability
+    world = world_of(results.config.environment.dynamics)
+    titles = judge(results, demonstrations, world, found)
+    for policy in results.policies:
+        if results.is_done(policy.name):
+            print(f"{policy.title}: {drive(results, policy.name, arguments.episodes)}")
     if arguments.picture:
-        draw(demonstrations, results["scores"], world, titles).savefig(arguments.picture, dpi=130)
+        draw(demonstrations, found.scores, world, titles).savefig(arguments.picture, dpi=130)
 
 
 if __name__ == "__main__":

@@ -1,32 +1,19 @@
 """How fast each environment is: its batched form beside the Gymnasium form, on one core.
 
 Both sides play random actions with resets, in turns; processor time is counted, so that another program on the same
-core counts for neither.
+core counts for neither. Run ``python benchmarks/environments.py --json FILE``.
 """
 
-# ruff: noqa: E402  (threads are limited before NumPy is imported, and the program may not be installed)
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-import argparse
-import json
 import statistics
-import sys
 import time
-from pathlib import Path
 from typing import Any
-
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
 
 import gymnasium
 import numpy as np
+from common import arguments_of, circumstances, one_thread, save
+from throughput import clock_as_shipped
 
-from benchmarks.throughput import clock_as_shipped, machine
 from oodil.pipeline.environments import make_batch
-from oodil.pipeline.versions import library_versions
 
 SIMULATORS = 32
 STEPS = 100
@@ -68,11 +55,11 @@ def speed(env_id: str, rounds: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    one_thread()
+    parser = arguments_of(__doc__)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    result: dict[str, Any] = {"machine": machine(), "versions": library_versions(), "environments": {}}
+    result = circumstances() | {"environments": {}}
     for name in ENVIRONMENTS:
         figures = result["environments"][name] = speed(f"oodil/{name}-v0", arguments.rounds)
         print(
@@ -80,8 +67,7 @@ def main() -> None:
             f"{figures['gymnasium_steps_per_s']:9,.0f} /s Gymnasium: {figures['ratio']:.1f} times",
             flush=True,
         )
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=2) + "\n")
+    save(arguments.json, result)
 
 
 if __name__ == "__main__":

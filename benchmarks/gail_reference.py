@@ -6,35 +6,25 @@ the constants of the method's released code instead of the defaults, ``ppo`` the
 ``wide`` and ``cheap`` what would be faster per step.
 """
 
-import argparse
-import json
 import multiprocessing
-import os
-import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-sys.path.insert(0, str(Path(__file__).parents[1]))
+import numpy as np
+from common import UNUSED, arguments_of, circumstances, one_thread, quiet, save
+from numpy.typing import NDArray
 
-import numpy as np  # noqa: E402
-from oodil.pipeline.experts import collect_demonstrations, load_expert  # noqa: E402
-
-from benchmarks.throughput import machine  # noqa: E402
-from oodil.pipeline.algorithms.gail import AdversarialReward  # noqa: E402
-from oodil.pipeline.algorithms.learner import Learner  # noqa: E402
-from oodil.pipeline.artifacts import Checkpoints  # noqa: E402
-from oodil.pipeline.collecting import InlineRollouts  # noqa: E402
-from oodil.pipeline.config import EnvironmentConfig, GailConfig  # noqa: E402
-from oodil.pipeline.evaluation import evaluate  # noqa: E402
-from oodil.pipeline.seeding import derive_key  # noqa: E402
-from oodil.pipeline.training import Probe, train  # noqa: E402
-from oodil.pipeline.versions import library_versions  # noqa: E402
+from oodil.pipeline.algorithms.gail import imitator
+from oodil.pipeline.config import EnvironmentConfig, GailConfig
+from oodil.pipeline.environments import environment_spec
+from oodil.pipeline.evaluation import evaluate
+from oodil.pipeline.seeding import derive_key
+from oodil.pipeline.stages.demonstrations import collect_demonstrations
+from oodil.pipeline.stages.experts import load_expert
+from oodil.pipeline.training import Probe, train
 
 ENV_ID = "oodil/Hopper-v0"
 EXPERT = Path(__file__).parents[1] / "configs" / "experts" / "hopper-gravity-9.8"
@@ -61,52 +51,37 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 
 
-@dataclass
-class Quiet:
-    """A job's context that reports to nobody and never stops."""
-
-    rollouts: InlineRollouts = field(default_factory=InlineRollouts)
-    checkpoint_interval_s: float = float("inf")
-
-    def progress(self, done: int, total: int, **metrics: float) -> None: ...
-
-    def warn(self, message: str) -> None: ...
-
-    def should_stop(self) -> bool:
-        return False
-
-
 def run_seed(seed: int, config: GailConfig) -> dict[str, Any]:
     policy, _ = load_expert(EXPERT)
     source = EnvironmentConfig(id=ENV_ID, dynamics=DEMONSTRATOR)
     demonstrations, _ = collect_demonstrations(
         policy,
         source,
-        "9.8",
+        0,
         10,
         seed,
         deterministic=False,
         full_length_only=True,
         minimum_return=None,
-        context=Quiet(),
+        context=quiet(),
     )
-    reward = AdversarialReward(demonstrations, np.ones(len(demonstrations)), config.discriminator, seed)
-    learner = Learner(demonstrations.observation_dim, 3, config, reward, seed)
+    spec, weights = environment_spec(ENV_ID, IMITATOR), np.ones(len(demonstrations))
+    learner = imitator(spec.observation_dim, spec.action_dim, demonstrations, weights, config, seed)
     seconds: list[float] = []
     evaluating = 0.0
     started = time.perf_counter()
 
-    def measure() -> np.ndarray:
+    def measure() -> NDArray[np.float64]:
         nonlocal evaluating
         begun = time.perf_counter()
         seconds.append(begun - started - evaluating)
         seen = evaluate(learner.behavior_policy(), ENV_ID, IMITATOR, 8, derive_key(seed, "benchmark"))
         evaluating += time.perf_counter() - begun
-        return seen.returns.mean()
+        return np.array(seen.mean_return)
 
     probe = Probe("return", max(1, config.total_steps // EVALUATION_INTERVAL), measure)
-    imitator = EnvironmentConfig(id=ENV_ID, dynamics=IMITATOR)
-    history = train(learner, imitator, config, [probe], Quiet(), Checkpoints(Path("unused"), {}))
+    environment = EnvironmentConfig(id=ENV_ID, dynamics=IMITATOR)
+    history = train(learner, environment, config, [probe], quiet(), UNUSED)
     returns, steps = history.values("return"), history.steps("return")
     reached = np.flatnonzero(returns >= TARGET_RETURN)
     first = int(reached[0]) if reached.size else None
@@ -122,14 +97,15 @@ def run_seed(seed: int, config: GailConfig) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    one_thread()
+    parser = arguments_of(__doc__)
     parser.add_argument("--setting", choices=sorted(SETTINGS), default="default")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=1_500_000)
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     config = GailConfig.model_validate({"total_steps": arguments.steps} | SETTINGS[arguments.setting])
+    found = circumstances()
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(arguments.processes, mp_context=context) as pool:
         results = list(pool.map(run_seed, range(arguments.seeds), [config] * arguments.seeds))
@@ -140,16 +116,8 @@ def main() -> None:
         f"{arguments.setting}: median steps to {TARGET_RETURN:,.0f}: {median(reached):,.0f}; mean final return "
         f"{np.mean([result['final_return'] for result in results]):,.0f}"
     )
-    if arguments.json:
-        whole = {
-            "machine": machine(),
-            "versions": library_versions(),
-            "setting": arguments.setting,
-            "processes": arguments.processes,
-            "config": config.model_dump(mode="json"),
-            "seeds": results,
-        }
-        arguments.json.write_text(json.dumps(whole, indent=1) + "\n")
+    found |= {"setting": arguments.setting, "processes": arguments.processes}
+    save(arguments.json, found | {"config": config.model_dump(mode="json"), "seeds": results})
 
 
 if __name__ == "__main__":

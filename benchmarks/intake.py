@@ -2,20 +2,12 @@
 
 Synthetic workers answer at once with a rollout that was collected beforehand, so all that is left is the learner's
 side: sending, receiving, decoding, deciding who gets what. Beside it, what a unit costs a real worker and what the
-update costs the learner, from which docs/scaling.md computes where one learner stops being enough.
+update costs the learner, from which docs/scaling.md computes where one learner stops being enough. Run
+``python benchmarks/intake.py --json FILE``.
 """
 
-# ruff: noqa: E402  (threads are limited before NumPy is imported, and the program may not be installed)
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-import argparse
-import json
 import multiprocessing
 import statistics
-import sys
 import tempfile
 import time
 from dataclasses import replace
@@ -23,20 +15,17 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+import numpy as np
+from common import arguments_of, circumstances, one_thread, run_config, save
 
-import torch
-
-from benchmarks.throughput import machine, run_config
 from oodil.bench import random_demonstrations
-from oodil.pipeline.algorithms.gail import AdversarialReward
+from oodil.pipeline.algorithms.gail import AdversarialReward, imitator
 from oodil.pipeline.algorithms.learner import Learner
 from oodil.pipeline.collecting import collect
 from oodil.pipeline.data import TransitionBatch, Unit, UnitResult
-from oodil.pipeline.environments import make_batch
+from oodil.pipeline.environments import environment_spec
 from oodil.pipeline.seeding import derive_key
-from oodil.pipeline.versions import collecting_versions, library_versions
+from oodil.pipeline.versions import collecting_versions
 from oodil.workers.channels import Dealer, private_endpoint
 from oodil.workers.messages import Header, Ready, ResultMessage, UnitMessage, decode, encode
 from oodil.workers.zmq_rollouts import ZmqRollouts
@@ -47,13 +36,12 @@ COLLECTED = 12
 """Units of which the real costs are taken, after as many that are not counted."""
 
 
-def learner_for(env_id: str) -> Learner:
+def learner_for(env_id: str) -> Learner[AdversarialReward]:
     """Return a learner with the default settings."""
     gail = run_config(env_id, 1).imitation.gail
     demonstrations = random_demonstrations(env_id)
-    reward = AdversarialReward(demonstrations, torch.ones(len(demonstrations)).double().numpy(), gail.discriminator, 0)
-    simulators = make_batch(env_id, {}, 1)
-    return Learner(simulators.observation_dim, simulators.action_dim, gail, reward, 0)
+    spec, weights = environment_spec(env_id, {}), np.ones(len(demonstrations))
+    return imitator(spec.observation_dim, spec.action_dim, demonstrations, weights, gail, 0)
 
 
 def real_costs(env_id: str) -> tuple[dict[str, float], Unit, UnitResult]:
@@ -141,14 +129,13 @@ def intake(workers: int, unit: Unit, result: UnitResult, seconds: float) -> dict
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    one_thread()
+    parser = arguments_of(__doc__)
     parser.add_argument("--envs", nargs="+", default=["oodil/Hopper-v0", "oodil/HalfCheetah-v0"], metavar="ID")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 4, 16, 64, 256], help="instant workers")
     parser.add_argument("--seconds", type=float, default=5.0, help="time of each measurement")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    found: dict[str, Any] = {"machine": machine(), "versions": library_versions(), "environments": {}}
+    found = circumstances() | {"environments": {}}
     for env_id in arguments.envs:
         costs, unit, result = real_costs(env_id)
         rates = [intake(workers, unit, result, arguments.seconds) for workers in arguments.workers]
@@ -164,8 +151,7 @@ def main() -> None:
                 f"{1e3 * rate['learner_s_per_unit']:.2f} ms of the learner each"
             )
         print(f"  one learner is busy with {costs['collect_s'] / busy_s:.1f} such workers", flush=True)
-    if arguments.json:
-        arguments.json.write_text(json.dumps(found, indent=2) + "\n")
+    save(arguments.json, found)
 
 
 if __name__ == "__main__":

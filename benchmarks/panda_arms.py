@@ -9,26 +9,19 @@ locked, random starts and random programmes of four constant actions.
 Run ``python benchmarks/panda_arms.py --json FILE``.
 """
 
-import argparse
-import json
-import sys
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 import mujoco
 import numpy as np
+from common import arguments_of, circumstances, one_thread, save
 from numpy.typing import NDArray
-from oodil.pipeline.experts import hand_written
 
-from benchmarks.throughput import machine
 from oodil.pipeline.environments import make_batch, panda
 from oodil.pipeline.environments.panda import ALL_JOINTS, BOX_START, TIME_STEP, Arm, Floats
 from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.seeding import numpy_rng
-from oodil.pipeline.versions import library_versions
+from oodil.pipeline.stages.demonstrations import hand_written
 
 ENV_ID = "oodil/Panda-v0"
 FOLLOWED_BY = {(1, 3): [(1, 3), (1,), (), (6,), (4,)], (1, 3, 4): [(1, 3), (4,)]}
@@ -122,16 +115,15 @@ def two_joints(arms: int, programmes: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    one_thread()
+    parser = arguments_of(__doc__)
     parser.add_argument("--episodes", type=int, default=16)
     parser.add_argument("--arms", type=int, default=60)
-    parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    results = {"follow": follow_all(arguments.episodes), "two_joints": two_joints(arguments.arms, 10)}
-    print(results["two_joints"])
-    if arguments.json:
-        whole = {"machine": machine(), "versions": library_versions(), **results}
-        arguments.json.write_text(json.dumps(whole, indent=1) + "\n")
+    found = circumstances()
+    found |= {"follow": follow_all(arguments.episodes), "two_joints": two_joints(arguments.arms, 10)}
+    print(found["two_joints"])
+    save(arguments.json, found)
 
 
 if __name__ == "__main__":

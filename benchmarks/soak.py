@@ -1,27 +1,18 @@
 """Whether any process of a run grows: the learner loop with two rollout workers for an hour, watched from outside.
 
-Prints the resident memory of every process each minute, and at the end how much each grew since the warm-up.
+Prints the resident memory of every process each minute, and at the end how much each grew since the warm-up. Run
+``python benchmarks/soak.py --json FILE``.
 """
 
-# ruff: noqa: E402  (the program may not be installed)
-import argparse
-import json
 import subprocess
-import sys
 import tempfile
 import time
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
-
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-from benchmarks.throughput import machine
-from oodil.pipeline.versions import library_versions
+from common import OODIL, arguments_of, circumstances, save
 
 WARM_UP = 0.15
 """Share of the time that is not judged: libraries load, caches and the lists of the progress display fill."""
@@ -51,15 +42,15 @@ def growth(minutes: list[float], megabytes: list[float]) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser = arguments_of(__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
     arguments = parser.parse_args()
+    found = circumstances() | {"minutes": arguments.minutes, "processes": {}}
     seen: dict[str, list[tuple[float, float]]] = defaultdict(list)
     with tempfile.TemporaryDirectory() as folder:
         # The budget has no end; the run is stopped when the time is over.
-        command = [sys.executable, str(ROOT / "orchestrator.py"), "run", str(ROOT / "configs" / "smoke.yaml")]
-        command += ["imitation.gail.total_steps=1_000_000_000", "baselines=[]", "--workers", "2"]
+        command = [*OODIL, "run", "smoke", "imitation.gail.total_steps=1_000_000_000", "baselines=[]"]
+        command += ["--workers", "2"]
         command += ["evaluation.num_points=1000", "--run-dir", str(Path(folder) / "run")]
         run = psutil.Popen(command, stdout=subprocess.DEVNULL)
         while not (Path(folder) / "run" / "logs" / "imitation-imitation.1.log").exists():
@@ -74,17 +65,14 @@ def main() -> None:
             time.sleep(min(60.0, arguments.minutes * 6))
         run.terminate()
         run.wait(timeout=600)
-    judged: dict[str, Any] = {}
     for name, points in seen.items():
         late = [(minute, megabytes) for minute, megabytes in points if minute > WARM_UP * arguments.minutes]
         if len(late) > 2:
-            minutes, megabytes = map(list, zip(*late, strict=True))
-            first, last, slope = megabytes[0], megabytes[-1], growth(minutes, megabytes)
-            judged[name] = {"first_mb": first, "last_mb": last, "mb_per_hour": slope}
+            slope = growth([minute for minute, _ in late], [megabytes for _, megabytes in late])
+            first, last = late[0][1], late[-1][1]
+            found["processes"][name] = {"first_mb": first, "last_mb": last, "mb_per_hour": slope}
             print(f"{name}: {first:.0f} -> {last:.0f} MB, {slope:+.1f} MB per hour")
-    if arguments.json:
-        found = {"machine": machine(), "versions": library_versions(), "minutes": arguments.minutes}
-        arguments.json.write_text(json.dumps(found | {"processes": judged}, indent=2) + "\n")
+    save(arguments.json, found)
 
 
 if __name__ == "__main__":

@@ -7,48 +7,38 @@ Each figure is a ratio whose two sides alternate within one run, so that a busy 
 * scaling: rollouts from two worker processes against those from one, for a learner that does nothing but take them in,
   so that each worker has a core to itself where there are two;
 * imitation: the same loop with PPO against the `imitation` library (benchmarks/README.md says how to install it).
+
+Run ``python benchmarks/throughput.py --rounds 2 --steps 200000 --json FILE``.
 """
 
-# ruff: noqa: E402  (threads are limited before NumPy is imported, and the program may not be installed)
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-import argparse
 import json
 import multiprocessing
-import platform
+import os
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
-
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
 
 import gymnasium
 import mujoco
 import numpy as np
 import torch
+from common import arguments_of, circumstances, one_thread, quiet, run_config, save
+from gymnasium.envs.mujoco import MujocoEnv
 from numpy.typing import NDArray
 
 from oodil.bench import learner_rate
 from oodil.pipeline.algorithms.networks import PolicyNetwork
-from oodil.pipeline.config import EnvironmentConfig, PpoConfig, RunConfig
+from oodil.pipeline.config import EnvironmentConfig, PpoConfig
 from oodil.pipeline.data import Snapshot
-from oodil.pipeline.environments import make_batch
-from oodil.pipeline.environments.batch import STATE
-from oodil.pipeline.loading import parse_config
+from oodil.pipeline.environments import environment_spec, make_batch
+from oodil.pipeline.environments.batch import STATE, MujocoBatch
 from oodil.pipeline.training import experience
-from oodil.pipeline.versions import library_versions
-from oodil.workers import rollout_worker as rollout_process
+from oodil.workers import rollout_worker
 from oodil.workers.channels import private_endpoint
 from oodil.workers.supervisor import Supervisor
 from oodil.workers.zmq_rollouts import ZmqRollouts
@@ -61,6 +51,7 @@ RAW_SECONDS = 3.0
 SCALING_STEPS = 4_000
 """Of each simulator."""
 IMITATION_BATCH, IMITATION_EPOCHS, IMITATION_MINIBATCH = 2560, 5, 512
+IMITATION_LOOP = Path(__file__).resolve().parent / "peers" / "imitation_gail.py"
 IMITATION_SETUP = """\
   python3.11 -m venv imitation-venv
   imitation-venv/bin/pip install imitation==1.0.1 'gymnasium[mujoco]==0.29.1' 'mujoco<3' 'setuptools<81'
@@ -86,8 +77,10 @@ class RawPhysics:
     """
 
     def __init__(self, env_id: str, as_shipped: bool = True) -> None:
-        self._task: Any = gymnasium.make(env_id).unwrapped
-        self._model = self._task.model if as_shipped else make_batch(env_id, {}, 1).model
+        task, batch = gymnasium.make(env_id).unwrapped, make_batch(env_id, {}, 1)
+        assert isinstance(task, MujocoEnv) and isinstance(batch, MujocoBatch)
+        self._frame_skip = task.frame_skip
+        self._model: mujoco.MjModel = task.model if as_shipped else batch.model
         self._as_shipped = as_shipped
         self._data = [mujoco.MjData(self._model) for _ in range(SIMULATORS)]
         self._controls = [data.ctrl for data in self._data]
@@ -99,7 +92,7 @@ class RawPhysics:
 
     def play(self, actions: NDArray[np.float32]) -> float:
         """Apply (T, G, A) actions and return the seconds of computation it took."""
-        model, frame_skip, step = self._model, self._task.frame_skip, mujoco.mj_step
+        model, frame_skip, step = self._model, self._frame_skip, mujoco.mj_step
         with clock_as_shipped() if self._as_shipped else nullcontext():
             started = time.process_time()
             for action in actions:
@@ -171,19 +164,6 @@ def raw_rate(env_id: str) -> float:
     return steps / seconds
 
 
-def run_config(env_id: str, total_steps: int, **gail: Any) -> RunConfig:
-    """Return a configuration that differs from the defaults in ``gail`` alone."""
-    gail = {"total_steps": total_steps} | gail
-    values = {
-        "name": "throughput",
-        "environment": {"id": env_id},
-        "demonstrations": {"file": "none"},
-        "transferability": {"gail": gail},
-        "imitation": {"gail": gail},
-    }
-    return parse_config(values, "throughput")
-
-
 def learner(env_id: str, workers: int, total_steps: int, rounds: int, cores: int) -> dict[str, Any]:
     """Compare the learner loop with bare physics on ``cores`` cores at once."""
     config = run_config(env_id, total_steps)
@@ -209,16 +189,16 @@ def learner(env_id: str, workers: int, total_steps: int, rounds: int, cores: int
 def rollout_rate(env_id: str, workers: int) -> float:
     """Return the steps per second that workers collect while nobody learns."""
     config = run_config(env_id, 1).imitation.gail
-    batch = make_batch(env_id, {}, 1)
-    network = PolicyNetwork(batch.observation_dim, batch.action_dim, config.policy_hidden, torch.Generator())
+    spec = environment_spec(env_id, {})
+    network = PolicyNetwork(spec.observation_dim, spec.action_dim, config.policy_hidden, torch.Generator())
     environment, policy = EnvironmentConfig(id=env_id), network.export()
     with tempfile.TemporaryDirectory() as folder, private_endpoint(Path(folder)) as endpoint:
         rollouts = ZmqRollouts(endpoint, "scaling", "first", unit_timeout_s=60.0)
-        context: Any = SimpleNamespace(rollouts=rollouts)
+        context = quiet(rollouts)
         with Supervisor(Path(folder), "scaling") as supervisor:
             for index in range(workers):
                 shared = {"endpoint": endpoint, "run_id": "scaling"}
-                supervisor.start(f"worker-{index}", rollout_process.main, shared)
+                supervisor.start(f"worker-{index}", rollout_worker.main, shared)
             supervisor.poll(0.0)
             experience(policy, environment, config, SCALING_STEPS // 4, 0, context)  # processes start
             started = time.perf_counter()
@@ -257,7 +237,7 @@ def imitation(python: str, total_steps: int, rounds: int, workers: int) -> dict[
         value={"epochs": IMITATION_EPOCHS, "minibatch_size": IMITATION_MINIBATCH},
     )
     peer_steps = total_steps // 4
-    command = [python, str(ROOT / "benchmarks" / "peers" / "imitation_gail.py")]
+    command = [python, str(IMITATION_LOOP)]
     command += [str(value) for value in (peer_steps, IMITATION_BATCH, IMITATION_EPOCHS, IMITATION_MINIBATCH)]
     theirs, inline, distributed, by_default = [], [], [], []
     peer: dict[str, Any] = {}
@@ -283,24 +263,9 @@ def imitation(python: str, total_steps: int, rounds: int, workers: int) -> dict[
     }
 
 
-def machine() -> dict[str, Any]:
-    """Describe where the figures come from."""
-    model = "unknown"
-    if Path("/proc/cpuinfo").exists():
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
-    return {
-        "platform": platform.platform(),
-        "cpu": model,
-        "cores": os.cpu_count(),
-        "load_average_before": os.getloadavg(),
-        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-    }
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    one_thread()
+    parser = arguments_of(__doc__)
     parser.add_argument("--parts", nargs="*", choices=PARTS, default=PARTS)
     parser.add_argument("--envs", nargs="+", choices=ENVIRONMENTS, default=ENVIRONMENTS, metavar="ID")
     parser.add_argument(
@@ -311,7 +276,7 @@ def main() -> None:
     parser.add_argument("--imitation-python", help="interpreter of an environment with `imitation`; adds that part")
     arguments = parser.parse_args()
     cores = min(2, os.cpu_count() or 1)
-    result: dict[str, Any] = {"machine": machine(), "versions": library_versions()}
+    result = circumstances()
     if "stepping" in arguments.parts:
         result["stepping"] = {}
         for env_id in arguments.envs:
@@ -356,10 +321,7 @@ def main() -> None:
         )
     else:
         print(f"imitation not measured; to measure it:\n{IMITATION_SETUP}")
-    result["machine"]["load_average_after"] = os.getloadavg()
-    if arguments.json:
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        arguments.json.write_text(json.dumps(result, indent=2) + "\n")
+    save(arguments.json, result)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,92 @@
+"""What several benchmarks need: one thread, where figures come from, a quiet job, the default configuration.
+
+It is imported from beside a script, as ``python benchmarks/NAME.py`` starts it; a script that is started does
+everything in a ``main`` behind a guard, because processes that it spawns import it again.
+"""
+
+import argparse
+import json
+import math
+import os
+import platform
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from threadpoolctl import threadpool_limits
+
+from oodil.pipeline.artifacts import Checkpoints
+from oodil.pipeline.collecting import InlineRollouts, RolloutSource
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.loading import parse_config
+from oodil.pipeline.stage import JobContext
+from oodil.pipeline.versions import library_versions
+from oodil.workers.fork_server import ONE_THREAD
+from oodil.workers.job import Context
+
+OODIL = [sys.executable, "-c", "import sys; from oodil.cli import main; sys.exit(main())"]
+"""The command line, as its console script starts it, with the interpreter that is running."""
+UNUSED = Checkpoints(Path("unused"), {})
+"""Of a `quiet` job, which writes none."""
+
+
+def one_thread() -> None:
+    """Let this process, and all that start from here, compute with one thread."""
+    os.environ.update(ONE_THREAD)
+    threadpool_limits(1)
+    torch.set_num_threads(1)
+
+
+def arguments_of(doc: str | None) -> argparse.ArgumentParser:
+    """Return a parser whose help is a script's docstring; ``--json FILE`` is for `save`."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to this file")
+    return parser
+
+
+def circumstances() -> dict[str, Any]:
+    """Return what figures depend on; ask before anything is measured, since the load is part of it."""
+    return {"machine": machine(), "versions": library_versions()}
+
+
+def machine() -> dict[str, Any]:
+    """Describe where the figures come from."""
+    model = "unknown"
+    if Path("/proc/cpuinfo").exists():
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
+    return {
+        "platform": platform.platform(),
+        "cpu": model,
+        "cores": os.cpu_count(),
+        "load_average_before": os.getloadavg(),
+        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+
+
+def save(path: Path | None, found: dict[str, Any]) -> None:
+    """Write `circumstances` and figures to a file, if one was asked for."""
+    if path is not None:
+        found["machine"]["load_average_after"] = os.getloadavg()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def quiet(rollouts: RolloutSource | None = None) -> JobContext:
+    """Return the context of a job that reports to nobody, writes no checkpoint and is never stopped."""
+    return Context(rollouts or InlineRollouts(), math.inf, send=lambda report: None, should_stop=lambda: False)
+
+
+def run_config(env_id: str, total_steps: int, **gail: Any) -> RunConfig:
+    """Return a configuration that differs from the defaults in ``gail`` alone."""
+    gail = {"total_steps": total_steps} | gail
+    values = {
+        "name": "benchmark",
+        "environment": {"id": env_id},
+        "demonstrations": {"file": "none"},
+        "transferability": {"gail": gail},
+        "imitation": {"gail": gail},
+    }
+    return parse_config(values, "benchmark")
