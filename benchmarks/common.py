@@ -27,7 +27,7 @@ from oodil.workers.fork_server import ONE_THREAD
 OODIL = [sys.executable, "-c", "import sys; from oodil.cli import main; sys.exit(main())"]
 """The command line, as its console script starts it, with the interpreter that is running."""
 UNUSED = Checkpoints(Path("unused"), {})
-"""Of a `quiet` job, which writes none."""
+"""Of a `Quiet` job, which writes none."""
 
 
 def one_thread() -> None:
