@@ -4,6 +4,12 @@ Stages say what is computed, an engine says where; here it is only decided what 
 no signal is handled here: an observer is told what happens, and a function is asked whether to stop.
 """
 
+# First of all: ``python orchestrator.py`` is the command line, which loads what a command needs by itself.
+if __name__ == "__main__":
+    from oodil.cli import main
+
+    main()
+
 import fcntl
 import json
 import time
@@ -15,7 +21,7 @@ from typing import Any
 from oodil.pipeline.artifacts import RunDirectory, read_artifact, remove_artifact, write_artifact, write_file
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.environments import check_environment
-from oodil.pipeline.errors import ConfigError, DamagedArtifactError, OodilError, StorageError
+from oodil.pipeline.errors import ConfigError, DamagedArtifactError, StorageError, UnfinishedError
 from oodil.pipeline.loading import parse_config
 from oodil.pipeline.stage import Run, Stage, state_of
 from oodil.pipeline.stages import stages
@@ -39,20 +45,6 @@ class Observer:
 
     def event(self, event: Event) -> None:
         """An engine reports on a job."""
-
-
-class UnfinishedError(OodilError):
-    """A stage failed or was stopped; what was finished is kept."""
-
-    def __init__(self, run: Run, stage: str, outcome: Outcome) -> None:
-        failures = "".join(f"{stage}/{job} failed:\n{traceback}\n\n" for job, traceback in outcome.failed.items())
-        super().__init__(
-            f"{failures}{stage}: {len(outcome.done)} jobs done, {len(outcome.failed)} failed, "
-            f"{len(outcome.not_run)} not finished. What is finished is kept; go on with: "
-            f"oodil resume {run.directory.path}"
-        )
-        self.stage = stage
-        self.outcome = outcome
 
 
 def open_run(path: Path, config: RunConfig, force: Collection[str] = ()) -> Run:
@@ -186,13 +178,25 @@ def _execute_stage(
     outcome = engine.run_jobs(stage, run, pending, observer.event, should_stop)
     if outcome.stopped or outcome.failed:
         _record(run.directory, "stage_interrupted", stage=stage.name, seconds=time.monotonic() - started)
-        raise UnfinishedError(run, stage.name, outcome)
+        raise _unfinished(run, stage.name, outcome)
     files = stage.combine(run)
     if files is not None:
         write_artifact(run.directory.stage(stage.name), stage.origin(run), files, library_versions())
     seconds = time.monotonic() - started
     _record(run.directory, "stage_finished", stage=stage.name, seconds=seconds)
     observer.stage_finished(stage.name, seconds)
+
+
+def _unfinished(run: Run, stage: str, outcome: Outcome) -> UnfinishedError:
+    """Say what became of a stage's jobs, and how to go on."""
+    failures = "".join(f"{stage}/{job} failed:\n{traceback}\n\n" for job, traceback in outcome.failed.items())
+    return UnfinishedError(
+        f"{failures}{stage}: {len(outcome.done)} jobs done, {len(outcome.failed)} failed, "
+        f"{len(outcome.not_run)} not finished. What is finished is kept; go on with: "
+        f"oodil resume {run.directory.path}",
+        stage,
+        outcome.failed,
+    )
 
 
 def _pending(stage: Stage, run: Run, forced: bool) -> list[str]:
@@ -246,9 +250,3 @@ def _record(directory: RunDirectory, event: str, **fields: Any) -> None:
 
 def _short(value: Any) -> str:
     return json.dumps(value.model_dump() if hasattr(value, "model_dump") else value)
-
-
-if __name__ == "__main__":
-    from oodil.cli import main
-
-    main()

@@ -21,15 +21,13 @@ from oodil.pipeline.artifacts import Checkpoints
 from oodil.pipeline.collecting import InlineRollouts, RolloutSource
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.loading import parse_config
-from oodil.pipeline.stage import JobContext
 from oodil.pipeline.versions import library_versions
 from oodil.workers.fork_server import ONE_THREAD
-from oodil.workers.job import Context
 
 OODIL = [sys.executable, "-c", "import sys; from oodil.cli import main; sys.exit(main())"]
 """The command line, as its console script starts it, with the interpreter that is running."""
 UNUSED = Checkpoints(Path("unused"), {})
-"""Of a `quiet` job, which writes none."""
+"""Of a `Quiet` job, which writes none."""
 
 
 def one_thread() -> None:
@@ -74,9 +72,24 @@ def save(path: Path | None, found: dict[str, Any]) -> None:
         path.write_text(json.dumps(found, indent=1) + "\n")
 
 
-def quiet(rollouts: RolloutSource | None = None) -> JobContext:
-    """Return the context of a job that reports to nobody, writes no checkpoint and is never stopped."""
-    return Context(rollouts or InlineRollouts(), math.inf, send=lambda report: None, should_stop=lambda: False)
+class Quiet:
+    """The context of a job that reports to nobody, writes no checkpoint and is never stopped."""
+
+    checkpoint_interval_s = math.inf
+
+    def __init__(self, rollouts: RolloutSource | None = None) -> None:
+        self.rollouts = rollouts or InlineRollouts()
+
+    def progress(self, done: int, total: int, **metrics: float) -> None:
+        """Nobody listens."""
+
+    def warn(self, message: str) -> None:
+        """Show it all the same."""
+        print(message)
+
+    def should_stop(self) -> bool:
+        """Never."""
+        return False
 
 
 def run_config(env_id: str, total_steps: int, **gail: Any) -> RunConfig:

@@ -14,7 +14,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from common import UNUSED, arguments_of, circumstances, one_thread, quiet, save
+from common import UNUSED, Quiet, arguments_of, circumstances, one_thread, save
 from numpy.typing import NDArray
 
 from oodil.pipeline.algorithms.gail import imitator
@@ -63,7 +63,7 @@ def run_seed(seed: int, config: GailConfig) -> dict[str, Any]:
         deterministic=False,
         full_length_only=True,
         minimum_return=None,
-        context=quiet(),
+        context=Quiet(),
     )
     spec, weights = environment_spec(ENV_ID, IMITATOR), np.ones(len(demonstrations))
     learner = imitator(spec.observation_dim, spec.action_dim, demonstrations, weights, config, seed)
@@ -81,7 +81,7 @@ def run_seed(seed: int, config: GailConfig) -> dict[str, Any]:
 
     probe = Probe("return", max(1, config.total_steps // EVALUATION_INTERVAL), measure)
     environment = EnvironmentConfig(id=ENV_ID, dynamics=IMITATOR)
-    history = train(learner, environment, config, [probe], quiet(), UNUSED)
+    history = train(learner, environment, config, [probe], Quiet(), UNUSED)
     returns, steps = history.values("return"), history.steps("return")
     reached = np.flatnonzero(returns >= TARGET_RETURN)
     first = int(reached[0]) if reached.size else None

@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from common import UNUSED, arguments_of, circumstances, one_thread, quiet, save
+from common import UNUSED, Quiet, arguments_of, circumstances, one_thread, save
 from numpy.typing import NDArray
 
 import oodil
@@ -39,7 +39,7 @@ def train_job(run_dir: Path, name: str) -> dict[str, NDArray]:
     def settled() -> NDArray[np.float64]:
         reward = cluster.reward(config, learner.reward_model.discriminator_arrays())
         policy, horizon = learner.behavior_policy(), spec.max_episode_steps
-        batch = experience(policy, environment, gail, horizon, cluster.seed, quiet())
+        batch = experience(policy, environment, gail, horizon, cluster.seed, Quiet())
         reward.settle(batch, section.final_steps, gail.steps_per_iteration)
         return reward.mean_logits(cluster.demonstrations)
 
@@ -48,7 +48,7 @@ def train_job(run_dir: Path, name: str) -> dict[str, NDArray]:
         return np.array(evaluate(policy, environment.id, environment.dynamics, EPISODES, key).mean_return)
 
     probes = [Probe("logits", READINGS, settled), Probe("return", READINGS, true_return)]
-    history = train(learner, environment, gail, probes, quiet(), UNUSED)
+    history = train(learner, environment, gail, probes, Quiet(), UNUSED)
     return {
         "env_steps": history.steps("logits"),
         "demonstrations": cluster.members,

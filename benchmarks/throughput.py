@@ -27,7 +27,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import torch
-from common import arguments_of, circumstances, one_thread, quiet, run_config, save
+from common import Quiet, arguments_of, circumstances, one_thread, run_config, save
 from gymnasium.envs.mujoco import MujocoEnv
 from numpy.typing import NDArray
 
@@ -194,7 +194,7 @@ def rollout_rate(env_id: str, workers: int) -> float:
     environment, policy = EnvironmentConfig(id=env_id), network.export()
     with tempfile.TemporaryDirectory() as folder, private_endpoint(Path(folder)) as endpoint:
         rollouts = ZmqRollouts(endpoint, "scaling", "first", unit_timeout_s=60.0)
-        context = quiet(rollouts)
+        context = Quiet(rollouts)
         with Supervisor(Path(folder), "scaling") as supervisor:
             for index in range(workers):
                 shared = {"endpoint": endpoint, "run_id": "scaling"}

@@ -299,6 +299,14 @@ class RunDirectory:
         """Return whether there are finished jobs or checkpoints of a stage."""
         return any((self.path / kind / stage).exists() for kind in ("jobs", "checkpoints"))
 
+    def metrics(self, stage: str, job: str) -> Path:
+        """What a job reported while it ran (`oodil.pipeline.metrics`)."""
+        return self.path / "metrics" / stage / f"{job}.jsonl"
+
+    def tensorboard(self, stage: str, job: str) -> Path:
+        """The same for TensorBoard."""
+        return self.path / "tensorboard" / stage / job
+
     def checkpoints(self, stage: str, job: str) -> Path:
         """The checkpoints of a job."""
         return self.path / "checkpoints" / stage / job

@@ -37,15 +37,23 @@ class RolloutSource(Protocol):
         """
 
 
-@lru_cache(maxsize=32)
-def _simulators(env_id: str, dynamics: tuple[tuple[str, float], ...], num_simulators: int, group: int) -> Simulators:
+@lru_cache(maxsize=4)
+def _groups(env_id: str, dynamics: tuple[tuple[str, float], ...], num_simulators: int) -> dict[int, Simulators]:
+    """Return the simulators of each group there was so far; those of the settings used last are kept."""
+    return {}
+
+
+def _simulators(unit: Unit) -> Simulators:
     # One for each group, since some can go on much faster from where they stand.
-    return make_batch(env_id, dict(dynamics), num_simulators)
+    groups = _groups(unit.env_id, unit.dynamics, unit.num_simulators)
+    if unit.group not in groups:
+        groups[unit.group] = make_batch(unit.env_id, dict(unit.dynamics), unit.num_simulators)
+    return groups[unit.group]
 
 
 def collect(unit: Unit) -> UnitResult:
     """Run one env group for ``num_steps`` steps; the result depends on nothing but ``unit``."""
-    simulators = _simulators(unit.env_id, unit.dynamics, unit.num_simulators, unit.group)
+    simulators = _simulators(unit)
     rng = numpy_rng(unit.key)
     shape = (unit.num_steps, unit.num_simulators)
     noise = rng.standard_normal((*shape, simulators.action_dim), dtype=np.float32)

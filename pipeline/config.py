@@ -355,8 +355,8 @@ class RunConfig(_Section):
     imitation: ImitationConfig
     """The final policy."""
     baselines: tuple[str, ...] = ()
-    """Policies that are trained beside it for comparison: `naive_gail`, `oracle`, or `module:name` for one that a module
-    of yours registers."""
+    """Policies that are trained beside it for comparison: `naive_gail`, `oracle`, or `module:name` for one that another
+    module registers."""
     evaluation: EvaluationConfig = EvaluationConfig()
     """What is measured beside the training."""
     runtime: RuntimeConfig = RuntimeConfig()

@@ -31,3 +31,13 @@ class DamagedArtifactError(OodilError):
 
 class StorageError(OodilError):
     """A folder or a disk that does not take what is to be written; the message names it."""
+
+
+class UnfinishedError(OodilError):
+    """A stage failed or was stopped; what was finished is kept."""
+
+    def __init__(self, message: str, stage: str, failed: dict[str, str]) -> None:
+        super().__init__(message)
+        self.stage = stage
+        self.failed = failed
+        """The first traceback, or how it died, of each job that failed; empty after a stop."""

@@ -222,11 +222,16 @@ class Transferability:
         history = {k: ScoreHistory(**named[k]) for k in sorted(named)}
         return cls(**arrays, env_steps=artifact.json(_SUMMARY)["env_steps"], history=history)
 
+    def columns(self) -> Arrays:
+        """Return (N,) arrays by the names that tables and exported files use."""
+        return {"cluster": self.clusters, "transferability": self.scores, "weight": self.weights}
+
     def table(self) -> list[dict[str, Any]]:
         """Return one row a demonstration: its number, cluster, transferability and weight."""
+        columns = self.columns()
         return [
-            {"demonstration": n, "cluster": int(k), "transferability": float(score), "weight": float(weight)}
-            for n, (k, score, weight) in enumerate(zip(self.clusters, self.scores, self.weights, strict=True))
+            {"demonstration": n, **{name: column[n].item() for name, column in columns.items()}}
+            for n in range(len(self.scores))
         ]
 
 

@@ -1,9 +1,9 @@
 """The training loop that experts, cluster jobs and the final learner share.
 
-Iteration i is collected under policy version i - lag (version 0 at first). With lag 1 a group begins iteration i + 1 as
-soon as its part of iteration i and update i - 1 are there, so workers collect while the learner learns and never wait
-for the slowest of them; what a unit contains does not depend on when it is handed out. All randomness is keyed by
-iteration, so a checkpoint holds no generator.
+Iteration i is collected under policy version i - lag (iteration 0 under version 0). With lag 1 a group begins iteration
+i + 1 as soon as its own part of iteration i and update i - 1 are finished, so workers collect while the learner updates
+and do not wait for the slowest group; the content of a unit does not depend on when it is handed out. All random
+numbers are keyed by iteration, so a checkpoint holds no generator state.
 """
 
 import time
@@ -28,11 +28,11 @@ Arrays = dict[str, NDArray]
 
 @dataclass(frozen=True)
 class Probe:
-    """Something measured now and then; it never influences the training."""
+    """A measurement at regular points of a training, which it does not influence."""
 
     name: str
     count: int
-    """Measurements, evenly spaced; the last one after the last iteration."""
+    """Number of measurements, evenly spaced; the last one follows the last iteration."""
     measure: Callable[[], NDArray]
     """Returns an array of fixed shape."""
 
@@ -42,7 +42,7 @@ class Probe:
 
 
 class History:
-    """What the probes saw: for each, the environment steps and the measurements, in order."""
+    """The measurements of each probe, in order, with the environment steps at which they were made."""
 
     def __init__(self) -> None:
         self._steps: dict[str, list[int]] = {}
@@ -80,17 +80,17 @@ class History:
 
 @dataclass
 class _Position:
-    """Where a training stands between two iterations."""
+    """The state of a training between two iterations, besides the learner's."""
 
     iteration: int
     policy_version: int
     policy: GaussianPolicy
-    """The one under which the next iteration is collected."""
+    """Collects the next iteration."""
     snapshots: list[Snapshot | None]
     history: History
 
     def unit(self, group: int, root_seed: int, environment: EnvironmentConfig, config: TrainingConfig) -> Unit:
-        """Return a group's unit of the next iteration."""
+        """Return the unit of a group in the next iteration."""
         return Unit(
             iteration=self.iteration,
             group=group,
@@ -113,7 +113,10 @@ def train(
     context: JobContext,
     checkpoints: Checkpoints,
 ) -> History:
-    """Train until the budget is spent, from the newest checkpoint if there is one.
+    """Train for the configured number of steps, from the newest checkpoint if there is one.
+
+    Each iteration reports to the context the metrics of `Learner.update`, and the mean ``return`` and ``length`` of the
+    last hundred episodes of training once one has ended.
 
     Raises JobStoppedError, after writing a checkpoint, when the context asks for a stop.
     """
@@ -144,7 +147,7 @@ def train(
             position.policy, position.policy_version = learner.behavior_policy(), position.iteration
             if not is_last:
                 context.rollouts.submit([unit(group) for group in range(config.num_groups)])
-        _refuse_divergence(learner, metrics, iteration)
+        _refuse_divergence(metrics, iteration)
 
         env_steps = position.iteration * config.steps_per_iteration
         for probe in probes:
@@ -176,7 +179,7 @@ def experience(
     root_seed: int,
     context: JobContext,
 ) -> TransitionBatch:
-    """Collect at least ``num_steps`` steps of every simulator under one policy, beginning with fresh episodes."""
+    """Collect at least ``num_steps`` steps of every simulator under one policy, starting with new episodes."""
     position = _Position(0, 0, policy, [None] * config.num_groups, History())
     seed = torch_seed(derive_key(root_seed, "experience"))
     rollouts = []
@@ -190,26 +193,30 @@ def experience(
 
 
 class _Recent:
-    """Mean over the last hundred ended episodes, for the progress line."""
+    """The mean over the last hundred finished episodes, for progress reports."""
 
     def __init__(self) -> None:
         self._values: list[float] = []
 
     def extend(self, values: NDArray) -> None:
+        """Add one value per finished episode."""
         self._values.extend(values.tolist())
         del self._values[:-100]
 
     def mean(self, name: str) -> dict[str, float]:
+        """Return the mean under ``name``, or nothing before the first episode has finished."""
         return {name: float(np.mean(self._values))} if self._values else {}
 
 
-def _refuse_divergence(learner: Learner, metrics: dict[str, float], iteration: int) -> None:
+def _refuse_divergence(metrics: dict[str, float], iteration: int) -> None:
+    """Raise FloatingPointError, naming the metrics, when one is not finite."""
     broken = [name for name, value in metrics.items() if not np.isfinite(value)]
     if broken:
         raise FloatingPointError(f"training diverged in iteration {iteration}: {', '.join(broken)} not finite")
 
 
 def _save(learner: Learner, position: _Position, checkpoints: Checkpoints) -> None:
+    """Write a checkpoint that `_resume` reads."""
     arrays: Arrays = {"position": np.array([position.iteration, position.policy_version], np.int64)}
     arrays |= nested("learner", {name: value.numpy() for name, value in learner.state_dict().items()})
     arrays |= nested("policy", position.policy.arrays()) | nested("history", position.history.arrays())
@@ -220,6 +227,7 @@ def _save(learner: Learner, position: _Position, checkpoints: Checkpoints) -> No
 
 
 def _resume(learner: Learner, config: TrainingConfig, context: JobContext, checkpoints: Checkpoints) -> _Position:
+    """Load the newest checkpoint into the learner and return its position; the initial one if there is none."""
     arrays, warnings = checkpoints.load()
     for warning in warnings:
         context.warn(warning)

@@ -28,11 +28,11 @@ from collections.abc import Callable
 from multiprocessing import connection
 from typing import IO, Any
 
+from oodil.workers.threads import ONE_THREAD
+
 Connection = connection.Connection
 wait = connection.wait
 
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""Set before a child, or the server for it, loads any library that computes."""
 IDLE_S = 60.0
 """A server without children ends after this long without a request; the next request starts another one."""
 LOST = 1_000

@@ -8,11 +8,13 @@ from pathlib import Path
 from oodil.pipeline.artifacts import RunDirectory, write_artifact
 from oodil.pipeline.collecting import InlineRollouts, RolloutSource
 from oodil.pipeline.config import RunConfig
+from oodil.pipeline.metrics import Metrics
 from oodil.pipeline.stage import JobStoppedError, Run, Stage, stage_named
 from oodil.pipeline.versions import library_versions
 from oodil.workers.channels import Access
 from oodil.workers.reports import DONE, STOPPED, Progress, Report, Silent, Warn
 from oodil.workers.supervisor import Link
+from oodil.workers.threads import one_thread
 from oodil.workers.wire import shortened
 
 _REPORT_INTERVAL_S = 0.2
@@ -20,7 +22,10 @@ _REPORT_INTERVAL_S = 0.2
 
 
 class Context:
-    """A job's view of where it runs, the same for every engine: ``send`` takes its reports to the engine."""
+    """A job's view of where it runs, the same for every engine: ``send`` takes its reports to the engine.
+
+    All figures are kept by ``metrics``; the engine hears of some.
+    """
 
     def __init__(
         self,
@@ -28,16 +33,19 @@ class Context:
         checkpoint_interval_s: float,
         send: Callable[[Report], None],
         should_stop: Callable[[], bool],
+        metrics: Metrics,
     ) -> None:
         self.rollouts = rollouts
         self.checkpoint_interval_s = checkpoint_interval_s
         self.should_stop = should_stop
         self._send = send
+        self._metrics = metrics
         self._next_report = 0.0
 
     def progress(self, done: int, total: int, **metrics: float) -> None:
         """Report ``done`` of ``total`` environment steps (or iterations) and current figures; cheap to call often."""
         figures = {name: float(value) for name, value in metrics.items()}
+        self._metrics.write(int(done), int(total), figures)
         now = time.monotonic()
         if now >= self._next_report or done >= total:
             self._next_report = now + _REPORT_INTERVAL_S
@@ -56,16 +64,22 @@ def run_job(
     send: Callable[[Report], None],
     should_stop: Callable[[], bool],
 ) -> str:
-    """Run a job in this process and write its artifact; its checkpoints go when that is safe on disk.
+    """Run a job in this process, with one compute thread, and write its artifact.
 
+    Its checkpoints are deleted when that is safe on disk.
     Returns DONE, or STOPPED when it stopped because ``should_stop`` returned true. Raises what the job raises.
     """
-    context = Context(rollouts, run.config.runtime.checkpoint_interval_s, send, should_stop)
+    directory = run.directory
     try:
-        files = stage.run_job(run, job, context)
+        with (
+            one_thread(),
+            Metrics(directory.metrics(stage.name, job), directory.tensorboard(stage.name, job)) as metrics,
+        ):
+            interval_s = run.config.runtime.checkpoint_interval_s
+            files = stage.run_job(run, job, Context(rollouts, interval_s, send, should_stop, metrics))
     except JobStoppedError:
         return STOPPED
-    write_artifact(run.directory.job(stage.name, job), stage.job_origin(run, job), files, library_versions())
+    write_artifact(directory.job(stage.name, job), stage.job_origin(run, job), files, library_versions())
     stage.checkpoints(run, job).clear()
     return DONE
 

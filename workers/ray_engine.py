@@ -29,12 +29,12 @@ from oodil.workers import job as job_process
 from oodil.workers.engine import POLL_S, JobLedger, OnEvent, Outcome, ShouldStop, refuse_main
 from oodil.workers.messages import Header, ResultMessage, UnitMessage, decode, encode
 from oodil.workers.reports import STOPPED, Failed, Finished, Report, decode_report, encode_report
+from oodil.workers.threads import limit_this_process
 from oodil.workers.wire import MessageError, shortened
 
 _LOST = "its process or its node is gone"
 _HEADER = Header("", "", "ray", 0)
 """Ray knows which answer belongs to which question."""
-_ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
 
 
 def connect(trusted: bool) -> None:
@@ -45,7 +45,7 @@ def connect(trusted: bool) -> None:
     """
     authenticated = os.environ.get("RAY_AUTH_MODE") == "token"
     _refuse_unless(trusted or authenticated or _is_here(os.environ.get("RAY_ADDRESS", "")))
-    ray.init(runtime_env={"env_vars": _ONE_THREAD}, include_dashboard=False, log_to_driver=False)
+    ray.init(include_dashboard=False, log_to_driver=False)
     addresses = {node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]}
     try:
         _refuse_unless(trusted or authenticated or addresses == {get_node_ip_address()})
@@ -250,6 +250,7 @@ class RayRollouts:
 
 def _collect(versions: str, frames: list[bytes], timeout_s: float) -> list[bytes]:
     """The task of a unit: the frames of a UnitMessage in, those of a ResultMessage out."""
+    limit_this_process()
     _refuse_other_versions(versions)
     message = decode(frames)
     if not isinstance(message, UnitMessage):

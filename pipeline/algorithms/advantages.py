@@ -15,10 +15,10 @@ def generalized_advantages(
     discount: float,
     gae_lambda: float,
 ) -> Array:
-    """Return (T, G) advantages; the sum is cut where an episode ends.
+    """Return (T, G) advantages; the sum over later steps stops where an episode ends.
 
-    A terminated step has no future value; a truncated one (a time limit) bootstraps from ``next_values``, and so does
-    the last step of the rollout. All arrays are (T, G).
+    The value after a terminated step is zero. A truncated step (a time limit) bootstraps from ``next_values``, and so
+    does the last step of the rollout. All arrays are (T, G).
     """
     errors = rewards + discount * next_values * ~terminated - values
     decay = np.float32(discount * gae_lambda) * ~(terminated | truncated)

@@ -2,9 +2,9 @@
 
 The encoder is trained first by the contrastive loss alone, then together with K centers that follow their members as
 running means. Unlike the paper, the counters of these means start above zero, as in the official code, centers stay on
-the unit sphere, and a demonstration stands for itself, at the start and at the end, by the mean feature of several
-sub-trajectories. The first phase is left out where the sub-trajectories of a demonstration agree on its cluster without
-it: it would only spread demonstrations evenly over the sphere and close the gap around a mode with few of them
+the unit sphere, and a demonstration is represented, when centers are initialized and when it is labeled, by the mean
+feature of several sub-trajectories. The warm-up is skipped where the sub-trajectories of a demonstration agree on its
+cluster without it: it would only spread demonstrations evenly over the sphere and close the gap around a small mode
 (docs/decisions.md).
 
 Letters: N demonstrations, B batch, l states of a sub-trajectory, S observation, E embedding, K clusters.
@@ -28,7 +28,7 @@ from oodil.pipeline.errors import DataError
 from oodil.pipeline.seeding import Key, derive_key, numpy_rng, torch_seed
 
 ENCODED_AT_ONCE = 1024
-"""Sub-trajectories per pass outside training; it bounds the memory."""
+"""Sub-trajectories per forward pass outside training; a limit on memory."""
 
 
 def assign(features: Tensor, centers: Tensor) -> Tensor:
@@ -46,10 +46,10 @@ def center_loss(features: Tensor, own_centers: Tensor, reduction: str) -> Tensor
 def moved_centers(centers: Tensor, counts: Tensor, features: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     """Return centers (K, E) and counters (K,) after Eqn (4) for all samples in sequence.
 
-    The running mean of m samples that begins at (n, c) ends at (n c + sum f) / (n + m), whatever their order.
+    The running mean of m samples that begins at (n, c) ends at (n c + sum f) / (n + m), in any order.
 
     Args:
-        centers, counts: (K, E) float32 and (K,) int64 as they stand.
+        centers, counts: (K, E) float32 and (K,) int64 before the update.
         features, labels: (2B, E) and (2B,) int64 in [0, K).
     """
     new = torch.bincount(labels, minlength=len(centers))
@@ -131,7 +131,7 @@ class ClusterModel:
 
 
 class ContrastiveClustering:
-    """Algorithm 1, one iteration per call; all that it remembers is in `state_dict`."""
+    """Algorithm 1, one iteration per `update`; `state_dict` is all of its state."""
 
     def __init__(self, demonstrations: Demonstrations, config: ClusteringConfig, root_seed: int) -> None:
         """Prepare the encoder. Raises DataError when there are fewer demonstrations than clusters."""
@@ -139,7 +139,7 @@ class ContrastiveClustering:
             raise DataError(f"{len(demonstrations)} demonstrations cannot form {config.num_clusters} clusters")
         self.config = config
         self.root_seed = root_seed
-        # One cluster takes everything in, whatever the encoder says.
+        # With one cluster there is nothing for the encoder to learn.
         self._warmup = config.warmup_iterations if config.num_clusters > 1 else 0
         self.num_iterations = self._warmup + config.joint_iterations if config.num_clusters > 1 else 0
         self.iteration = 0
@@ -158,7 +158,7 @@ class ContrastiveClustering:
         self._begin()
 
     def update(self) -> dict[str, float]:
-        """Do one iteration and return metrics: loss, contrastive_loss."""
+        """Run one iteration and return metrics: loss, contrastive_loss."""
         config = self.config
         rng = numpy_rng(self._key("batch", self.iteration))
         chosen = rng.permutation(len(self._subtrajectories))[: config.batch_size]
@@ -182,7 +182,7 @@ class ContrastiveClustering:
         return {"loss": float(loss.detach()), "contrastive_loss": float(contrastive.detach())}
 
     def model(self) -> ClusterModel:
-        """Return the encoder and the centers as they stand."""
+        """Return the current encoder and centers."""
         sampling = self._subtrajectories.sampling
         return ClusterModel(self.encoder, self.centers, self.counts, sampling, self._state_mean, self._state_scale)
 
@@ -201,7 +201,7 @@ class ContrastiveClustering:
         self.iteration = int(tensors["iteration"])
 
     def _begin(self) -> None:
-        """Place the centers and go straight to the joint phase where there is no warm-up, or no need for it."""
+        """Initialize the centers and skip the warm-up where there is none, or where labels are stable without it."""
         sufficient = self.config.sufficient_stability
         if self._warmup == 0 or sufficient is not None:
             centers, stability = self._initial_centers()
@@ -225,6 +225,7 @@ class ContrastiveClustering:
         return centers, _stability(features, mean, centers)
 
     def _move_centers(self, features: Tensor, labels: Tensor) -> None:
+        """Update centers and counters with a batch (Eqn 4)."""
         centers, self.counts = moved_centers(self.centers, self.counts, features, labels)
         self.centers = normalize(centers, dim=-1) if self.config.normalize_centers else centers
 

@@ -20,12 +20,12 @@ from oodil.pipeline.config import ClusteringConfig
 from oodil.pipeline.data import Demonstrations
 
 LONGEST_SUBTRAJECTORY = 50
-"""States; a recurrent encoder forgets what is further back (appendix B)."""
+"""In states; a recurrent encoder forgets earlier ones (appendix B)."""
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """How sub-trajectories are taken: the same for all demonstrations, so that speed stays visible in them."""
+    """Length and stride of sub-trajectories: equal for all demonstrations, so that their speeds can be compared."""
 
     length: int
     """l, states per sub-trajectory."""
@@ -34,14 +34,14 @@ class Sampling:
 
     @classmethod
     def plan(cls, lengths: NDArray[np.int64], config: ClusteringConfig) -> "Sampling":
-        """Choose what spans most of the shortest of the demonstrations, whose (N,) lengths are given."""
+        """Choose length and stride so that they span most of the shortest demonstration, for (N,) lengths."""
         shortest, size = int(lengths.min()), config.subtrajectory_length
         if config.sampling == "fixed_length":
             return cls(length=size, stride=max(1, shortest // size))
         return cls(length=min(max(2, shortest // size), LONGEST_SUBTRAJECTORY), stride=size)
 
     def strides(self, lengths: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return (N,) strides: smaller ones for demonstrations that are too short for the common one."""
+        """Return (N,) strides, smaller for demonstrations that are too short for the common one."""
         longest = np.maximum(1, (lengths - 1) // (self.length - 1))
         return np.minimum(self.stride, longest)
 
@@ -68,7 +68,7 @@ class Sampling:
 
 
 class Subtrajectories:
-    """Standardized demonstrations, ready to be sampled: one gather per batch, however long each one is."""
+    """Standardized demonstrations in one tensor, from which a batch of sub-trajectories is one gather."""
 
     def __init__(
         self,

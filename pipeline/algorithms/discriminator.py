@@ -20,15 +20,15 @@ from oodil.pipeline.config import DiscriminatorConfig
 from oodil.pipeline.data import Demonstrations, offsets_of
 
 
-def discriminator_loss(demonstration_logits: Tensor, policy_logits: Tensor) -> Tensor:
-    """Return -E_demo log D - E_policy log(1 - D), each term averaged, for (M,) and (B,) logits."""
-    return softplus(-demonstration_logits).mean() + softplus(policy_logits).mean()
+def discriminator_losses(demonstration_logits: Tensor, policy_logits: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the two terms of the loss, -E_demo log D and -E_policy log(1 - D), for (M,) and (B,) logits."""
+    return softplus(-demonstration_logits).mean(), softplus(policy_logits).mean()
 
 
 def imitation_reward(logits_expert_is_high: Tensor, kind: Literal["positive", "logit"]) -> Tensor:
     """Return (B,) rewards, large where a pair looks like a demonstration.
 
-    ``positive`` is -log(1 - D), the reward of GAIL. It also pays for going on; see docs/algorithms.md. ``logit`` is
+    ``positive`` is -log(1 - D), the reward of GAIL, which also rewards survival; see docs/algorithms.md. ``logit`` is
     log D - log(1 - D), the logit itself, the reward of AIRL (Fu et al. 2018, https://arxiv.org/abs/1710.11248).
     """
     return softplus(logits_expert_is_high) if kind == "positive" else logits_expert_is_high
@@ -45,7 +45,7 @@ class Discriminator(nn.Module):
         self.restart_optimizer()
 
     def restart_optimizer(self) -> None:
-        """Begin with fresh moments, at the configured learning rate."""
+        """Reset the optimizer's moments and learning rate."""
         self.optimizer = Adam(list(self.parameters()), self.config.learning_rate)
 
     def forward(self, pairs: Tensor) -> Tensor:
@@ -53,19 +53,25 @@ class Discriminator(nn.Module):
         return self.net(pairs).squeeze(-1)
 
     def pairs(self, states: NDArray[np.float32], successors: NDArray[np.float32]) -> Tensor:
-        """Return (B, 2S) from (B, S) states and their successors, without the dimensions that are ignored."""
+        """Return (B, 2S) inputs from (B, S) states and their successors, without the ignored dimensions."""
         if self.config.ignored:
             states, successors = states[:, self._seen], successors[:, self._seen]
         return torch.from_numpy(np.concatenate((states, successors), axis=1))
 
     def update(self, demonstration_pairs: Tensor, policy_pairs: Tensor) -> dict[str, float]:
-        """Take one full-batch step on (M, 2S) demonstration pairs against (B, 2S) policy pairs."""
+        """Take one full-batch step on (M, 2S) demonstration pairs against (B, 2S) policy pairs.
+
+        Returns metrics of the discriminator as it was before: its loss, and loss and accuracy on either side.
+        """
         count = len(demonstration_pairs)
         logits = self(torch.cat((demonstration_pairs, policy_pairs)))
-        loss = discriminator_loss(logits[:count], logits[count:])
+        demonstration_loss, policy_loss = discriminator_losses(logits[:count], logits[count:])
+        loss = demonstration_loss + policy_loss
         self.optimizer.step(loss)
         return {
             "discriminator_loss": float(loss.detach()),
+            "discriminator_demonstration_loss": float(demonstration_loss.detach()),
+            "discriminator_policy_loss": float(policy_loss.detach()),
             "demonstration_accuracy": float((logits[:count] > 0).float().mean()),
             "policy_accuracy": float((logits[count:] < 0).float().mean()),
         }

@@ -1,7 +1,7 @@
 """Generative adversarial imitation from states, with weighted demonstrations: the paper's Eqn (5), (7) and (8).
 
-Uniform weights over a cluster's demonstrations give a transferability job, uniform weights over all demonstrations give
-naive GAIL, and weights from the transferability give the method itself.
+The weights make the difference between its uses: the jobs that measure transferability weigh the demonstrations of one
+cluster equally, naive GAIL weighs all demonstrations equally, and the method weighs them by their transferability.
 
 Letters: N demonstrations, M transitions of all of them, B policy pairs, S observation.
 """
@@ -25,7 +25,7 @@ from oodil.pipeline.seeding import derive_key, numpy_rng, torch_seed
 
 
 class AdversarialReward:
-    """A discriminator as reward model: it rewards what looks like the weighted demonstrations."""
+    """The reward model of GAIL: a discriminator that rewards transitions like those of the weighted demonstrations."""
 
     def __init__(
         self,
@@ -52,7 +52,7 @@ class AdversarialReward:
         self._paired: tuple[TransitionBatch, Tensor] | None = None
 
     def state_moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return mean and standard deviation (S,) of the demonstrations' states as they are weighted."""
+        """Return the (S,) mean and standard deviation of the demonstrations' states under their weights."""
         states = self._observations.astype(np.float64)
         mean = np.average(states, axis=0, weights=self._state_weights)
         variance = np.average(np.square(states - mean), axis=0, weights=self._state_weights)
@@ -60,13 +60,13 @@ class AdversarialReward:
 
     @torch.no_grad()
     def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
-        """Return (T, G) rewards of the discriminator before its own step of the same iteration."""
+        """Return (T, G) rewards; `Learner` asks for them before the discriminator's step of the same iteration."""
         logits = self.discriminator(self._policy_pairs(batch))
         rewards = imitation_reward(logits, self.discriminator.config.reward).numpy()
         return rewards.reshape(batch.terminated.shape)
 
     def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
-        """Step the discriminator on the batch against as many demonstration pairs, or all of them if fewer."""
+        """Train the discriminator on the batch and as many demonstration pairs, but no more than there are."""
         config = self.discriminator.config
         self.discriminator.optimizer.learning_rate = config.learning_rate * step_scale
         policy_pairs = self._policy_pairs(batch)
@@ -78,11 +78,11 @@ class AdversarialReward:
         return metrics
 
     def settle(self, batch: TransitionBatch, steps: int, batch_size: int) -> None:
-        """Go on with the discriminator alone, against a batch of a policy that no longer learns.
+        """Train the discriminator alone, against a batch of a policy that no longer changes.
 
-        While both learn, a discriminator is always behind: for a while even an imitator that fails may fool it. Each of
-        the ``steps`` draws ``batch_size`` pairs from either side. The optimizer begins anew: its moments are of a
-        policy that moved, and its steps had shrunk.
+        While both learn, the discriminator lags behind the policy, and even an imitator that fails may fool it for a
+        while. Each of the ``steps`` draws ``batch_size`` pairs from either side. The optimizer is reset: its moments
+        belong to a policy that was changing, and its learning rate had been annealed.
         """
         self.discriminator.restart_optimizer()
         policy_pairs = self._policy_pairs(batch)
@@ -107,11 +107,11 @@ class AdversarialReward:
         self.discriminator.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})
 
     def mean_logits(self, demonstrations: Demonstrations) -> NDArray[np.float64]:
-        """Return (N,) mean logits of demonstrations by the discriminator as it stands."""
+        """Return (N,) mean logits of the current discriminator over each demonstration."""
         return mean_logit_per_demonstration(self.discriminator, demonstrations)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the discriminator and its optimizer."""
+        """Return the parameters of the discriminator and the moments of its optimizer."""
         discriminator = self.discriminator
         return nested("net", discriminator.state_dict()) | nested("optimizer", discriminator.optimizer.state_dict())
 
@@ -121,7 +121,7 @@ class AdversarialReward:
         self.discriminator.optimizer.load_state_dict(below("optimizer", state))
 
     def _policy_pairs(self, batch: TransitionBatch) -> Tensor:
-        """Return B pairs: each state with its successor, step by step. They are kept, as an iteration asks twice."""
+        """Return (B, 2S) inputs of the discriminator; those of the last batch are kept, as an iteration asks twice."""
         if self._paired is None or self._paired[0] is not batch:
             shape = len(batch), -1
             pairs = self.discriminator.pairs(batch.observations.reshape(shape), batch.next_observations.reshape(shape))

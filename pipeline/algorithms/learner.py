@@ -1,9 +1,9 @@
-"""One on-policy learner for every use: a policy optimizer, a value function, and a source of reward.
+"""The on-policy learner of experts and imitators: a policy optimizer, a value function and a reward model.
 
-An iteration is: reward from the model as it stands -> advantages -> policy step -> value fit -> the reward model's own
-step. Experts learn from the environment's reward, imitators from a discriminator; nothing else differs.
+An iteration is: rewards of the current reward model -> advantages -> policy step -> value fit -> step of the reward
+model. Experts learn from the environment's reward, imitators from a discriminator; nothing else differs.
 
-Letters: T steps, G simulators (all groups side by side), B = T * G, S observation, A action.
+Letters: T steps, G simulators (all env groups side by side), B = T * G, S observation, A action.
 """
 
 from typing import Any, Generic, Protocol, TypeVar
@@ -24,20 +24,20 @@ from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.seeding import derive_key, torch_seed
 
 SMALLEST_DEVIATION = 1e-4
-"""A state dimension that varies less than this is not blown up any further."""
+"""Smallest standard deviation by which an input is divided; a smaller one would magnify noise."""
 
 
 class RewardModel(Protocol):
     """Where an iteration's rewards come from."""
 
     def state_moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return mean and standard deviation (S,) of the states ahead, or None to learn them from rollouts."""
+        """Return (S,) mean and standard deviation to normalize states by; None lets the learner estimate them."""
 
     def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
         """Return (T, G) rewards."""
 
     def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
-        """Learn from the iteration's batch and return metrics; ``step_scale`` multiplies the step size."""
+        """Take the iteration's training step and return metrics; ``step_scale`` multiplies the step size."""
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return everything needed to continue."""
@@ -47,10 +47,10 @@ class RewardModel(Protocol):
 
 
 class EnvReward:
-    """The environment's own reward: for training experts, and for nothing else."""
+    """The environment's own reward, for training experts only."""
 
     def state_moments(self) -> None:
-        """Nothing is known beforehand."""
+        """Return None: the states are not known before training."""
         return None
 
     def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
@@ -58,22 +58,22 @@ class EnvReward:
         return batch.env_rewards.astype(np.float32)
 
     def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
-        """There is nothing to learn."""
+        """Return no metrics: an environment's reward does not learn."""
         return {}
 
     def state_dict(self) -> dict[str, Tensor]:
-        """There is nothing to keep."""
+        """Return nothing: an environment's reward has no state."""
         return {}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """There is nothing to load."""
+        """Accept the empty state."""
 
 
 Reward = TypeVar("Reward", bound=RewardModel)
 
 
 class Learner(Generic[Reward]):
-    """Policy, value function and reward model, and how one iteration changes them."""
+    """A policy, a value function and a reward model, updated together once per iteration."""
 
     def __init__(
         self, observation_dim: int, action_dim: int, config: TrainingConfig, reward_model: Reward, root_seed: int
@@ -95,15 +95,26 @@ class Learner(Generic[Reward]):
         self._moments = torch.zeros(1 + 2 * observation_dim, dtype=torch.float64)
 
     def behavior_policy(self) -> GaussianPolicy:
-        """Return a copy of the present policy, ready to be sent."""
+        """Return a copy of the current policy for rollout workers."""
         return self.policy.export()
 
     def update(self, batch: TransitionBatch, iteration: int) -> dict[str, float]:
-        """Learn from one iteration's batch and return metrics."""
+        """Learn from one iteration's batch.
+
+        Returns metrics, by names that do not change:
+            reward: mean of the rewards that the policy learned from.
+            policy_lag: updates since the policy that collected the batch, 0 or 1.
+            kl: divergence from the policy before the update, in nats per state.
+            entropy: of the new policy, in nats.
+            value_loss: mean squared error in the last minibatch.
+            improvement, step_fraction: of TRPO alone, see `Trpo.update`.
+            discriminator_loss, discriminator_demonstration_loss, discriminator_policy_loss, demonstration_accuracy,
+            policy_accuracy: of imitators alone, see `Discriminator.update`.
+        """
         config = self.config
         step_scale = 1 - iteration / config.num_iterations if config.anneal else 1.0
         rng = torch.Generator().manual_seed(torch_seed(derive_key(self.root_seed, "learner", iteration)))
-        # Scaled by 1 - discount, values are averages of rewards: of order one, whatever the horizon.
+        # Scaled by 1 - discount, values are averages of rewards, and so of order one for every horizon.
         rewards = self.reward_model.rewards(batch) * np.float32(self._reward_scale)
         observations = torch.from_numpy(batch.observations).flatten(0, 1)
         if self._tracks_moments:
@@ -113,7 +124,7 @@ class Learner(Generic[Reward]):
         advantages = generalized_advantages(
             rewards, values, next_values, batch.terminated, batch.truncated, config.discount, config.gae_lambda
         )
-        metrics = {"reward": float(rewards.mean())}
+        metrics = {"reward": float(rewards.mean()), "policy_lag": float(iteration - batch.policy_version)}
         metrics |= self.policy_optimizer.update(
             observations,
             torch.from_numpy(batch.actions).flatten(0, 1),
@@ -129,7 +140,7 @@ class Learner(Generic[Reward]):
     @torch.no_grad()
     def _values(self, inputs: Tensor, batch: TransitionBatch) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return (T, G) values of the states, given normalized as ``inputs`` (B, S), and of their successors."""
-        # The next state's value is the next row's, but for episode ends and the last row: only those cost a pass.
+        # The successor's value is in the next row, except at episode ends and in the last row: only those cost a pass.
         values = self.value(inputs).numpy().reshape(batch.terminated.shape)
         next_values = np.empty_like(values)
         next_values[:-1] = values[1:]
@@ -141,7 +152,7 @@ class Learner(Generic[Reward]):
 
     @torch.no_grad()
     def _track(self, observations: Tensor) -> None:
-        """Move the input normalizer to the mean and deviation of all observations so far."""
+        """Set the input normalizer to the mean and standard deviation of all observations so far."""
         wide = observations.double()
         self._moments += torch.cat((torch.tensor([float(len(wide))]), wide.sum(0), wide.square().sum(0)))
         count, (total, squares) = self._moments[0], self._moments[1:].view(2, -1)
@@ -149,6 +160,7 @@ class Learner(Generic[Reward]):
         self._normalize_by(mean, (squares / count - mean.square()).clamp_min(0).sqrt())
 
     def _normalize_by(self, mean: Tensor, deviation: Tensor) -> None:
+        """Set the input normalizer to (S,) mean and standard deviation."""
         self.policy.input_mean.copy_(mean)
         self.policy.input_scale.copy_(1 / deviation.clamp_min(SMALLEST_DEVIATION))
 

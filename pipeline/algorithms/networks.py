@@ -1,4 +1,4 @@
-"""The networks of the method: two tanh layers, a small head (docs/algorithms.md).
+"""The networks of the method: two tanh layers and a small output layer (docs/algorithms.md).
 
 Losses are differentiated by autograd, twice where a gradient is penalized. Only what a Fisher-vector product needs, and
 the regression of the value function, uses the derivatives of `Linearization`, which cost less than a graph.
@@ -47,7 +47,7 @@ class Tanh(torch.autograd.Function):
 
 
 class MLP(nn.Module):
-    """Linear layers with tanh between them; the head starts small (weights x 0.1, bias 0)."""
+    """Linear layers with tanh between them; the output layer starts small (weights x 0.1, bias 0)."""
 
     def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int, rng: torch.Generator) -> None:
         super().__init__()
@@ -144,7 +144,7 @@ class PolicyNetwork(nn.Module):
         """Return a copy for rollout workers."""
         layers = self.net.layers
         return GaussianPolicy(
-            # A plain ascontiguousarray would not copy a column, which would then change while it is being sent.
+            # ascontiguousarray would not copy a single column, which would then change while it is being sent.
             weights=tuple(np.array(layer.weight.detach().numpy().T, order="C") for layer in layers),
             biases=tuple(layer.bias.detach().numpy().copy() for layer in layers),
             log_std=self.log_std.detach().numpy().copy(),

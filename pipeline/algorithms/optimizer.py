@@ -1,4 +1,4 @@
-"""torch's Adam behind the calls that a learner needs."""
+"""torch's Adam for losses and for known gradients, with a state of named tensors."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ class Adam:
 
     @property
     def learning_rate(self) -> float:
-        """The present step size."""
+        """The current step size."""
         return float(self._optimizer.param_groups[0]["lr"])
 
     @learning_rate.setter

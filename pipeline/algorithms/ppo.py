@@ -18,7 +18,7 @@ def clipped_surrogate(log_probs: Tensor, old_log_probs: Tensor, advantages: Tens
 
 
 class Ppo:
-    """Several epochs of minibatch gradient steps per batch; its state is the optimizer's."""
+    """Several epochs of minibatch gradient steps per batch; Adam's moments are its only state."""
 
     def __init__(self, policy: PolicyNetwork, config: PpoConfig) -> None:
         self.policy = policy
@@ -42,11 +42,9 @@ class Ppo:
         rng: torch.Generator,
         step_scale: float,
     ) -> dict[str, float]:
-        """Improve the policy on one batch of (B, S), (B, A), (B,) and (B,); minibatches are drawn with ``rng``.
+        """Improve the policy on one batch, see `PolicyOptimizer`; minibatches are drawn with ``rng``.
 
-        ``step_scale`` multiplies the step size.
-
-        Returns metrics: kl (of the last minibatch, estimated), entropy.
+        Returns metrics: kl (estimated in the last minibatch, before its step), entropy.
         """
         config, policy = self.config, self.policy
         self._optimizer.learning_rate = config.learning_rate * step_scale

@@ -1,8 +1,9 @@
 """Trust region policy optimization (Schulman et al. 2015), https://arxiv.org/abs/1502.05477.
 
-The step solves F x = g by conjugate gradients with Fisher-vector products computed forward-mode through the mean
-network (one pass forward, one backward, no second derivatives), then halves it until the surrogate improves inside the
-trust region. Unlike the official code of the paper we imitate, the line search checks the divergence too.
+The direction x solves F x = g by conjugate gradients. A product with the Fisher matrix F = J^T M J takes a forward-mode
+and a reverse-mode pass through the mean network (`Linearization`), and no second derivatives. A line search then halves
+the step until the surrogate improves inside the trust region. Unlike the official code of the paper that we imitate,
+the line search checks the divergence, too.
 
 Letters: B batch, S observation, A action, P parameters.
 """
@@ -36,7 +37,7 @@ def conjugate_gradient(product: Callable[[Tensor], Tensor], b: Tensor, iteration
 
 
 class Trpo:
-    """One natural-gradient step per batch. It has no state besides the policy."""
+    """One natural-gradient step per batch; it has no state."""
 
     def __init__(self, policy: PolicyNetwork, config: TrpoConfig) -> None:
         self.policy = policy
@@ -61,15 +62,11 @@ class Trpo:
         rng: torch.Generator,
         step_scale: float,
     ) -> dict[str, float]:
-        """Improve the policy on one batch.
+        """Improve the policy on one batch, see `PolicyOptimizer`; nothing is drawn with ``rng``.
 
-        Args:
-            observations, actions: (B, S) and (B, A).
-            log_probs: (B,) under the policy that acted; it may be one version behind.
-            advantages: (B,) standardized.
-            rng: unused; every policy optimizer has the same signature.
-            step_scale: factor on the trust region.
-        Returns metrics: kl, improvement, step_fraction (0 when the step was refused), entropy.
+        ``step_scale`` multiplies the trust region, and so its root the step.
+
+        Returns metrics: kl, improvement of the surrogate, step_fraction (0 when the step was refused), entropy.
         """
         config, policy = self.config, self.policy
         max_kl = config.max_kl * step_scale
@@ -78,7 +75,7 @@ class Trpo:
         surrogate = (torch.exp(policy.log_prob(mean, actions) - log_probs) * advantages).mean()
         gradient = _flatten(torch.autograd.grad(surrogate, self._parameters))
         old_mean, old_log_std = mean.detach(), policy.log_std.detach().clone()
-        # Curvature is needed less exactly than the gradient, and its products are the expensive part of a step.
+        # The curvature may be less exact than the gradient, and products with it are the expensive part of a step.
         linearization = Linearization(policy.net, inputs[:: config.fisher_every].contiguous())
         precision = torch.exp(-2 * old_log_std) / len(linearization.output)
 
@@ -112,14 +109,17 @@ class Trpo:
         return {"kl": 0.0, "improvement": 0.0, "step_fraction": 0.0, "entropy": float(policy.entropy().detach())}
 
     def _unflatten(self, vector: Tensor) -> list[Tensor]:
+        """Return views of a (P,) vector in the shapes of the parameters."""
         return [part.view(shape) for part, shape in zip(vector.split(self._sizes), self._shapes, strict=True)]
 
     def _assign(self, vector: Tensor) -> None:
+        """Set the policy's parameters to a (P,) vector."""
         for parameter, value in zip(self._parameters, self._unflatten(vector), strict=True):
             parameter.copy_(value)
 
 
 def _flatten(tensors: list[Tensor] | tuple[Tensor, ...]) -> Tensor:
+    """Return one (P,) vector of all elements."""
     return torch.cat([t.reshape(-1) for t in tensors])
 
 

@@ -22,13 +22,16 @@ class ValueFunction(nn.Module):
         return self.net(inputs).squeeze(-1)
 
     def fit(self, inputs: Tensor, targets: Tensor, rng: torch.Generator) -> dict[str, float]:
-        """Regress ``targets`` (B,) on ``inputs`` (B, S), each epoch in fresh random minibatches."""
+        """Fit the values of ``inputs`` (B, S) to ``targets`` (B,), in newly drawn minibatches each epoch.
+
+        Returns metrics: value_loss, the mean squared error in the last minibatch before its step.
+        """
         errors = torch.zeros(1)
         for _ in range(self.config.epochs):
             order = torch.randperm(len(inputs), generator=rng)
             size = self.config.minibatch_size
             for some_inputs, some_targets in zip(inputs[order].split(size), targets[order].split(size), strict=True):
-                # By hand, since on batches this small a graph would double the time, which is half of an update's.
+                # No graph: it would double the time of a batch this small, and this loop is half of an update.
                 at = Linearization(self.net, some_inputs)
                 errors = at.output.squeeze(-1) - some_targets
                 gradient = errors * (2 / len(errors))

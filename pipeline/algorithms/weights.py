@@ -20,10 +20,10 @@ def transferability_of_logits(mean_logits: Array) -> Array:
 
 
 def share_lasted(demonstrations: Demonstrations, horizon: int) -> Array:
-    """Return (N,) the part of ``horizon`` steps that each demonstration covers; 1 unless it ended in failure.
+    """Return (N,) shares of ``horizon`` steps that the demonstrations lasted; 1 for those that did not fail.
 
-    After a failure there is nothing left to reproduce. Over the whole horizon, as the others are judged, a
-    demonstration that fell after a tenth of it is worth a tenth, however well the tenth can be imitated.
+    All demonstrations are scored over the whole horizon, and nothing can be reproduced after a failure: one that fell
+    after a tenth of the horizon scores at most a tenth, however well that tenth can be imitated.
     """
     lasted = np.minimum(1.0, (demonstrations.lengths - 1) / horizon)
     return np.where(demonstrations.terminated, lasted, 1.0)
@@ -39,6 +39,6 @@ def sharpened_weights(scores: Array, sharpening: float) -> Array:
 
 
 def sampling_mass(weights: Array, demonstrations: Demonstrations) -> Array:
-    """Return (N,) shares of the drawn transitions: weight times number of transitions (Eqn 7)."""
+    """Return (N,) shares of the sampled transitions, proportional to weight times number of transitions (Eqn 7)."""
     mass = weights * (demonstrations.lengths - 1)
     return np.asarray(mass / mass.sum())

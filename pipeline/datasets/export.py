@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,33 +12,27 @@ from oodil.pipeline.artifacts import write_file
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.datasets import minari, robomimic
 from oodil.pipeline.errors import DataError
-from oodil.pipeline.results import Transferability
 
 TARGETS = "FILE.csv (a new table), FILE.hdf5 (masks and attributes) or minari:DATASET_ID (episode metadata)"
 
 
-def export(demonstrations: Demonstrations, transferability: Transferability, target: str) -> str:
+def export(demonstrations: Demonstrations, columns: Mapping[str, NDArray[Any]], target: str) -> str:
     """Write cluster, transferability and weight of (N,) demonstrations and return what was done.
 
     Args:
         demonstrations: those of the run; an existing target must hold exactly these.
-        transferability: what the run says of them.
+        columns: (N,) each, among them ``cluster`` and ``weight``.
         target: one of `TARGETS`.
 
     Raises DataError.
     """
     path = Path(target)
-    found: dict[str, NDArray[Any]] = {
-        "cluster": transferability.clusters,
-        "transferability": transferability.scores,
-        "weight": transferability.weights,
-    }
     try:
         if target.startswith("minari:"):
-            minari.write_metadata(target.removeprefix("minari:"), demonstrations, found)
+            minari.write_metadata(target.removeprefix("minari:"), demonstrations, columns)
             return f"{target}: metadata of {len(demonstrations)} episodes"
         if path.suffix in (".hdf5", ".h5"):
-            chosen = robomimic.write_masks(path, demonstrations, found)
+            chosen = robomimic.write_masks(path, demonstrations, columns)
             return f"{path}: mask/oodil_transferable with {chosen} of {len(demonstrations)} demonstrations"
     except ImportError as error:
         raise DataError(f"{target}: needs {error.name}; pip install 'oodil[data]'") from error
@@ -45,9 +40,9 @@ def export(demonstrations: Demonstrations, transferability: Transferability, tar
         raise DataError(f"{target}: unknown format; give {TARGETS}")
     text = io.StringIO(newline="")
     table = csv.writer(text)
-    table.writerow(["demonstration", "source", "states", *found])
+    table.writerow(["demonstration", "source", "states", *columns])
     for n, length in enumerate(demonstrations.lengths.tolist()):
         source = demonstrations.source_labels[demonstrations.sources[n]]
-        table.writerow([n, source, length, *(column[n].item() for column in found.values())])
+        table.writerow([n, source, length, *(column[n].item() for column in columns.values())])
     write_file(path, text.getvalue().encode())
     return f"{path}: {len(demonstrations)} rows"

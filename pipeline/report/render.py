@@ -48,6 +48,8 @@ class WeightingSection:
     """What a weighting says of single demonstrations."""
 
     title: str
+    rule: str
+    """How weights follow from scores."""
     figure: Markup
     convergence: Markup | None
     """None for a weighting without trainings of its own."""
@@ -227,6 +229,7 @@ def _weighting(found: Findings, sources: Sources, name: str) -> WeightingSection
         colors[cluster] = sources.looks[most_frequent].color
     return WeightingSection(
         title=found.title(name),
+        rule=found.rule(name),
         figure=figures.transferability(weighting.scores, sources.index, sources.looks),
         convergence=figures.convergence(weighting.history, colors) if weighting.history else None,
     )

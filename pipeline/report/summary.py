@@ -89,6 +89,11 @@ class Findings:
         titles |= {each.name: each.title for each in self.results.weightings}
         return titles[stage]
 
+    def rule(self, weighting: str) -> str:
+        """Return how weights follow from scores."""
+        stage = next(each for each in self.results.weightings if each.name == weighting)
+        return stage.rule(self.results.config)
+
 
 def finding(found: Findings) -> str:
     """Return the main result in one sentence: our return beside those of the other policies."""

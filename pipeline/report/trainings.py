@@ -6,8 +6,8 @@ Letters: M rows of metrics.
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from oodil.pipeline.metrics import read_metrics
 from oodil.pipeline.report.figures import Training
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.stages import PolicyStage, stages
@@ -26,7 +26,7 @@ def read_trainings(results: RunResults) -> dict[str, list[Training]]:
         if not results.is_done(stage.name):
             continue
         for job in stage.jobs(results.run):
-            path = results.path / "metrics" / stage.name / f"{job}.jsonl"
+            path = results.run.directory.metrics(stage.name, job)
             group, title = stage.name, job.replace("-", " ")
             if isinstance(stage, PolicyStage):
                 group, title = "policies", stage.title
@@ -37,16 +37,10 @@ def read_trainings(results: RunResults) -> dict[str, list[Training]]:
 
 
 def _read(path: Path, title: str) -> Training | None:
-    from oodil.pipeline.metrics import read_metrics
-
     metrics = read_metrics(path)
     needed = ("step", "demonstration_accuracy", "policy_accuracy")
     if any(name not in metrics or len(metrics[name]) < FEWEST_ROWS for name in needed):
         return None
-    steps, demonstrations, policy = (_floats(metrics[name]) for name in needed)
-    returns = _floats(metrics["return"]) if "return" in metrics else np.full(len(steps), np.nan)
+    steps, demonstrations, policy = (metrics[name] for name in needed)
+    returns = metrics.get("return", np.full(len(steps), np.nan))
     return Training(title, steps, demonstrations, policy, returns)
-
-
-def _floats(values: NDArray) -> NDArray[np.float64]:
-    return np.asarray(values, np.float64)

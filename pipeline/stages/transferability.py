@@ -43,6 +43,11 @@ class TransferabilityStage(Weighting):
         """Return how the discriminators are read."""
         return {"final_steps": config.transferability.final_steps}
 
+    def rule(self, config: RunConfig) -> str:
+        """Say how sharp the weights are."""
+        power = config.transferability.sharpening
+        return super().rule(config) + ("" if power == 1 else f" to the power {power:g}")
+
     def jobs(self, run: Run) -> list[str]:
         """Return one job per imitator, under its name."""
         return ImitatorsStage().jobs(run)

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 
+from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.errors import OodilError
 from oodil.pipeline.results import Transferability
@@ -17,6 +18,10 @@ class Weighting(Stage):
     def load(self, run: Run) -> Transferability:
         """Return what it says of the run's demonstrations. Raises NotFinishedError."""
         return Transferability.load(run.artifact(self.name))
+
+    def rule(self, config: RunConfig) -> str:
+        """Say, for the report, how a demonstration's weight follows from its score."""
+        return "a demonstration is drawn for imitation in proportion to its score"
 
     @abstractmethod
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:

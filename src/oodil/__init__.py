@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from oodil.api import evaluate, open_run, run
-    from oodil.orchestrator import Observer, UnfinishedError
+    from oodil.orchestrator import Observer
     from oodil.pipeline.config import RunConfig
     from oodil.pipeline.data import Demonstrations
     from oodil.pipeline.datasets import read_demonstrations
-    from oodil.pipeline.errors import OodilError
+    from oodil.pipeline.errors import OodilError, UnfinishedError
     from oodil.pipeline.loading import load_config, shipped_configs
     from oodil.pipeline.report import write_report
     from oodil.pipeline.results import (
@@ -62,11 +62,11 @@ __all__ = [
 
 _HOMES = {
     "oodil.api": ("evaluate", "open_run", "run"),
-    "oodil.orchestrator": ("Observer", "UnfinishedError"),
+    "oodil.orchestrator": ("Observer",),
     "oodil.pipeline.config": ("RunConfig",),
     "oodil.pipeline.data": ("Demonstrations",),
     "oodil.pipeline.datasets": ("read_demonstrations",),
-    "oodil.pipeline.errors": ("OodilError",),
+    "oodil.pipeline.errors": ("OodilError", "UnfinishedError"),
     "oodil.pipeline.loading": ("load_config", "shipped_configs"),
     "oodil.pipeline.report": ("write_report",),
     "oodil.pipeline.results": (

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from oodil.pipeline.errors import ConfigError, OodilError, StorageError
+from oodil.pipeline.errors import ConfigError, OodilError, StorageError, UnfinishedError
 
 if TYPE_CHECKING:
     from oodil.pipeline.config import RunConfig
@@ -31,13 +31,11 @@ class _Commands(typer.core.TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command."""
-        from oodil.orchestrator import UnfinishedError
-
         try:
             return super().invoke(ctx)
         except UnfinishedError as error:
             print(f"\n{error}", file=sys.stderr)
-            raise typer.Exit(EXIT_FAILED if error.outcome.failed else EXIT_STOPPED) from None
+            raise typer.Exit(EXIT_FAILED if error.failed else EXIT_STOPPED) from None
         except OodilError as error:
             print(f"oodil: {error}", file=sys.stderr)
             raise typer.Exit(EXIT_BAD_INPUT) from None
@@ -339,7 +337,7 @@ def export_demos(
     from oodil.pipeline.datasets.export import export
 
     results = open_run(run_dir)
-    print(export(results.demonstrations, results.transferability, target))
+    print(export(results.demonstrations, results.transferability.columns(), target))
 
 
 def _engine(

@@ -13,6 +13,7 @@ from typing import Any
 import psutil
 import pytest
 
+from oodil.pipeline.metrics import read_metrics
 from oodil.workers.channels import endpoint_folder
 from oodil.workers.local_engine import LocalEngine
 from oodil.workers.reports import AttemptFailed, Event, Failed, Finished, Progress, Replaced, Started, Warn
@@ -153,6 +154,7 @@ def test_a_job_that_is_killed_continues_from_its_checkpoint(tmp_path: Path) -> N
     assert failures(events) == [("killed", 1, True)]
     assert "SIGKILL" in next(e.report.reason for e in events if isinstance(e.report, AttemptFailed))
     assert lines(tmp_path / "killed.began_at") == ["0", "3"]
+    assert read_metrics(run.directory.metrics("jobs", "killed"))["step"].tolist() == [1, 2, 3, 4, 5, 6]
     assert run.job_artifact("jobs", "killed").sha256 == run.job_artifact("jobs", "a").sha256
 
 

@@ -4,9 +4,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from oodil.pipeline.artifacts import read_artifact
+from oodil.pipeline.metrics import read_metrics
 from oodil.pipeline.stage import Run
 from oodil.workers.channels import endpoint_folder
 from oodil.workers.engine import Outcome
@@ -44,6 +46,8 @@ def test_the_result_does_not_depend_on_the_number_of_workers(tmp_path: Path, dis
         assert any(isinstance(e.report, Progress) and (e.report.done, e.report.total) == (6, 6) for e in events)
         assert not run.directory.checkpoints(stage, "a").exists()
         assert "torch" in run.job_artifact(stage, "a").versions
+        metrics = read_metrics(run.directory.metrics(stage, "a"))
+        assert metrics["step"].tolist() == [1, 2, 3, 4, 5, 6] and np.isfinite(metrics["reward"]).all()
         hashes |= {content(run, stage, "a"), content(run, stage, "b")}
     assert len(hashes) == 1
 

@@ -13,6 +13,7 @@ from ray.cluster_utils import Cluster
 from oodil.orchestrator import open_run, walk
 from oodil.pipeline.artifacts import read_artifact
 from oodil.pipeline.collecting import InlineRollouts
+from oodil.pipeline.errors import ConfigError, UnusableEnvironmentError
 from oodil.pipeline.loading import load_config
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.stages import stages
@@ -126,7 +127,7 @@ def test_a_unit_that_hangs_is_collected_again(misdeeds: Path, cluster: Cluster, 
 def test_a_unit_that_raises_says_why(cluster: Cluster) -> None:
     source = RayRollouts(unit_timeout_s=60)
     source.submit(hopper_units(0, count=1, env_id="oodil/Nowhere-v0"))
-    with pytest.raises(ValueError, match="oodil/Nowhere-v0"):
+    with pytest.raises(UnusableEnvironmentError, match="oodil/Nowhere-v0"):
         source.gather()
 
 
@@ -155,13 +156,13 @@ def test_a_cluster_of_several_machines_must_ask_for_a_token(cluster: Cluster, mo
     """A third node at another address makes it one of several machines."""
     ray.shutdown()
     cluster.add_node(num_cpus=1, node_ip_address="127.0.0.2")
-    with pytest.raises(ValueError, match="RAY_AUTH_MODE=token"):
+    with pytest.raises(ConfigError, match="RAY_AUTH_MODE=token"):
         connect(trusted=False)
     assert not ray.is_initialized()
     connect(trusted=True)
     ray.shutdown()
     monkeypatch.setenv("RAY_ADDRESS", "ray.lab.example:6379")
-    with pytest.raises(ValueError, match="RAY_AUTH_MODE=token"):
+    with pytest.raises(ConfigError, match="RAY_AUTH_MODE=token"):
         connect(trusted=False)
 
 
@@ -171,6 +172,6 @@ def test_a_folder_that_a_node_does_not_see_is_refused(tmp_path: Path, cluster: C
     for path in sorted(run.directory.path.rglob("*"), reverse=True):
         path.rmdir() if path.is_dir() else path.unlink()
     run.directory.path.rmdir()
-    with pytest.raises(ValueError, match=r"does not see .*gone"):
+    with pytest.raises(ConfigError, match=r"does not see .*gone"):
         RayEngine().run_jobs(FakeStage(False), run, ["a"], events.append, lambda: False)
     assert not [event for event in events if isinstance(event.report, Progress)]

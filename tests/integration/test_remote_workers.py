@@ -196,11 +196,11 @@ def test_keys_are_made_once_and_kept_from_others(access: Access) -> None:
 def test_a_worker_with_other_libraries_ends_with_the_reason(
     access: Access, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from oodil.workers import learner as learner_module
+    from oodil.workers import zmq_rollouts
 
-    monkeypatch.setattr(learner_module, "collecting_versions", lambda: "mujoco 0.0.0")
+    monkeypatch.setattr(zmq_rollouts, "collecting_versions", lambda: "mujoco 0.0.0")
     remote = remote_worker(access, create_worker_keys(access.keys, "elsewhere", new_key_pair), tmp_path / "logs")
-    source = learner_module.ZmqRollouts(f"ipc://{tmp_path}/s", "a run", "learner.1", 60.0, access=access)
+    source = zmq_rollouts.ZmqRollouts(f"ipc://{tmp_path}/s", "a run", "learner.1", 60.0, access=access)
     try:
         output, _ = remote.communicate(timeout=30)
         assert remote.returncode == 1 and "refused: this worker has" in output and "mujoco 0.0.0" in output

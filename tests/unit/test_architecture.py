@@ -148,6 +148,35 @@ def test_the_bottom_stays_at_the_bottom():
         assert not {name for name in names if name.startswith(tuple(f"oodil.pipeline.{each}" for each in above))}, path
 
 
+def loaded_at_import(tree: ast.Module) -> Iterator[str]:
+    """Yield what a file imports when it is imported itself, not in functions and not for type checkers alone."""
+    for node in tree.body:
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            yield from imported(ast.Module([node], []))
+
+
+def room(module: str) -> str:
+    """Return the file or folder of the pipeline, or the part of the program, that a module belongs to."""
+    parts = module.removeprefix("oodil.").split(".")
+    return ".".join(parts[:2]) if parts[0] == "pipeline" else parts[0]
+
+
+def test_no_room_leads_back_to_itself():
+    """Files and folders of the pipeline, workers, orchestrator and command line import each other in no circle."""
+    arrows: dict[str, set[str]] = {}
+    for name in sources():
+        module = name.removeprefix("src/oodil/").removesuffix(".py").replace("/", ".").removesuffix(".__init__")
+        targets = {room(each) for each in loaded_at_import(parse(name)) if each.startswith("oodil.")}
+        arrows.setdefault(room(module), set()).update(targets - {room(module)})
+    while True:
+        free = [name for name, targets in arrows.items() if not targets & arrows.keys()]
+        if not free:
+            break
+        for name in free:
+            del arrows[name]
+    assert not arrows, f"a circle among {sorted(arrows)}"
+
+
 @pytest.mark.parametrize(
     ("file", "text", "check"),
     [

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from oodil.pipeline.algorithms.discriminator import Discriminator, discriminator_loss, imitation_reward
+from oodil.pipeline.algorithms.discriminator import Discriminator, discriminator_losses, imitation_reward
 from oodil.pipeline.config import DiscriminatorConfig
 
 
@@ -25,20 +25,25 @@ def test_loss_by_hand():
     # D = sigmoid(logit): log 3 -> 3/4, -log 3 -> 1/4, 0 -> 1/2.
     demonstration_logits = torch.tensor([math.log(3), 0.0])
     policy_logits = torch.tensor([-math.log(3), 0.0, math.log(3)])
-    expected = -(math.log(3 / 4) + math.log(1 / 2)) / 2 - (math.log(3 / 4) + math.log(1 / 2) + math.log(1 / 4)) / 3
-    assert float(discriminator_loss(demonstration_logits, policy_logits)) == pytest.approx(expected, rel=1e-6)
+    expected = (
+        -(math.log(3 / 4) + math.log(1 / 2)) / 2,
+        -(math.log(3 / 4) + math.log(1 / 2) + math.log(1 / 4)) / 3,
+    )
+    losses = discriminator_losses(demonstration_logits, policy_logits)
+    assert [float(loss) for loss in losses] == pytest.approx(expected, rel=1e-6)
 
 
 def test_loss_is_binary_cross_entropy_with_demonstrations_as_one():
     rng = torch.Generator().manual_seed(0)
     demonstration, policy = torch.randn(7, generator=rng), torch.randn(9, generator=rng)
     entropy = torch.nn.functional.binary_cross_entropy_with_logits
-    expected = entropy(demonstration, torch.ones(7)) + entropy(policy, torch.zeros(9))
-    torch.testing.assert_close(discriminator_loss(demonstration, policy), expected)
+    expected = entropy(demonstration, torch.ones(7)), entropy(policy, torch.zeros(9))
+    torch.testing.assert_close(discriminator_losses(demonstration, policy), expected)
 
 
 def test_loss_stays_finite_for_extreme_logits():
-    assert float(discriminator_loss(torch.tensor([-200.0]), torch.tensor([200.0]))) == pytest.approx(400.0)
+    losses = discriminator_losses(torch.tensor([-200.0]), torch.tensor([300.0]))
+    assert [float(loss) for loss in losses] == pytest.approx([200.0, 300.0])
 
 
 def test_reward_by_hand():
@@ -96,7 +101,10 @@ def test_metrics_describe_the_state_before_the_step(pairs):
     with torch.no_grad():
         logits = discriminator(demonstration), discriminator(policy)
     metrics = discriminator.update(demonstration, policy)
-    assert metrics["discriminator_loss"] == pytest.approx(float(discriminator_loss(*logits)), rel=1e-5)
+    losses = [float(loss) for loss in discriminator_losses(*logits)]
+    assert metrics["discriminator_loss"] == pytest.approx(sum(losses), rel=1e-5)
+    assert metrics["discriminator_demonstration_loss"] == pytest.approx(losses[0], rel=1e-5)
+    assert metrics["discriminator_policy_loss"] == pytest.approx(losses[1], rel=1e-5)
     assert metrics["demonstration_accuracy"] == pytest.approx(float((logits[0] > 0).float().mean()))
     assert metrics["policy_accuracy"] == pytest.approx(float((logits[1] < 0).float().mean()))
 

@@ -2,17 +2,14 @@
 
 import json
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from oodil.pipeline import stage as stage_module
 from oodil.pipeline.artifacts import Files, RunDirectory, write_artifact
@@ -20,6 +17,7 @@ from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.errors import StorageError
 from oodil.pipeline.loading import parse_config
+from oodil.pipeline.metrics import Metrics
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.report import Report, context, summary, write_report
 from oodil.pipeline.report.figures import MUTED, POLICIES, contrast, source_looks
@@ -562,28 +560,13 @@ def test_unstable_clusters_are_called_out(tmp_path: Path) -> None:
     assert "clusters are unstable" in notes(run) and "41 %" in notes(run)
 
 
-@pytest.fixture
-def reader_of_metrics(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stand-in for the reader of metrics."""
-
-    def read_metrics(path: Path) -> dict[str, NDArray]:
-        rows = [json.loads(line) for line in path.read_text().splitlines()]
-        names = dict.fromkeys(name for row in rows for name in row)
-        return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
-
-    module = ModuleType("oodil.pipeline.metrics")
-    module.read_metrics = read_metrics  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-
-
 def write_metrics(run: Run, stage: str, job: str, rows: list[dict[str, float]]) -> None:
     """Write the metrics of a job, as its process does."""
-    path = run.directory.path / "metrics" / stage / f"{job}.jsonl"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    with Metrics(run.directory.metrics(stage, job)) as metrics:
+        for row in rows:
+            metrics.write(int(row["step"]), 5000, {name: value for name, value in row.items() if name != "step"})
 
 
-@pytest.mark.usefixtures("reader_of_metrics")
 def test_trainings_are_drawn_where_there_are_metrics(tmp_path: Path) -> None:
     run = full_run(tmp_path, **SMALL)
     assert "How the trainings went" not in render(run).text

@@ -2,12 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from oodil.pipeline.algorithms.gail import imitator
 from oodil.pipeline.algorithms.learner import EnvReward, Learner
 from oodil.pipeline.artifacts import Checkpoints
 from oodil.pipeline.collecting import InlineRollouts
-from oodil.pipeline.config import EnvironmentConfig, TrainingConfig, ValueConfig
+from oodil.pipeline.config import EnvironmentConfig, GailConfig, PpoConfig, TrainingConfig, TrpoConfig, ValueConfig
 from oodil.pipeline.training import train
 
 
@@ -18,8 +20,10 @@ class Context:
 
     def __init__(self) -> None:
         self.rollouts = InlineRollouts()
+        self.reported: list[dict[str, float]] = []
 
-    def progress(self, done: int, total: int, **metrics: float) -> None: ...
+    def progress(self, done: int, total: int, **metrics: float) -> None:
+        self.reported.append(metrics)
 
     def warn(self, message: str) -> None: ...
 
@@ -42,3 +46,38 @@ def test_a_training_that_diverges_names_the_figure_and_leaves_no_checkpoint_of_i
         train(learner, EnvironmentConfig(), config, [], Context(), checkpoints)
     arrays, _ = checkpoints.load()
     assert arrays is None or all((value == value).all() for value in arrays.values())
+
+
+ALWAYS = {"reward", "policy_lag", "kl", "entropy", "value_loss", "return", "length"}
+TRPO = {"improvement", "step_fraction"}
+DISCRIMINATOR = {
+    "discriminator_loss",
+    "discriminator_demonstration_loss",
+    "discriminator_policy_loss",
+    "demonstration_accuracy",
+    "policy_accuracy",
+}
+
+
+@pytest.mark.parametrize("lag", [0, 1])
+@pytest.mark.parametrize("imitate", [False, True], ids=["env_reward", "gail"])
+@pytest.mark.parametrize("kind", ["trpo", "ppo"])
+def test_what_a_training_reports(tmp_path: Path, demonstrations, kind, imitate, lag) -> None:
+    """The names are those that metrics.jsonl holds: who renames one breaks what others read."""
+    config = GailConfig(
+        total_steps=3 * 2 * 2 * 20,
+        num_groups=2,
+        simulators_per_group=2,
+        steps_per_rollout=20,
+        lag=lag,
+        policy_optimizer=TrpoConfig() if kind == "trpo" else PpoConfig(),
+    )
+    shown = demonstrations(30, observation_dim=12)
+    learner = imitator(12, 3, shown, np.ones(1), config, 0) if imitate else Learner(12, 3, config, EnvReward(), 0)
+    context = Context()
+    train(learner, EnvironmentConfig(), config, [], context, Checkpoints(tmp_path, {}))
+    expected = ALWAYS | (TRPO if kind == "trpo" else set()) | (DISCRIMINATOR if imitate else set())
+    assert set(context.reported[-1]) == expected
+    assert set().union(*context.reported) == expected
+    assert [metrics["policy_lag"] for metrics in context.reported] == [0, lag, lag]
+    assert all(np.isfinite(list(metrics.values())).all() for metrics in context.reported)

@@ -11,6 +11,7 @@ import torch
 import oodil.pipeline.collecting
 from oodil.pipeline.collecting import collect
 from oodil.pipeline.data import Unit
+from oodil.pipeline.environments import make_batch
 from oodil.pipeline.seeding import derive_key, numpy_rng
 
 HOPPER, CHEETAH = "oodil/Hopper-v0", "oodil/HalfCheetah-v0"
@@ -40,7 +41,7 @@ def test_nothing_collected_before_matters(unit, network, assert_same_bits):
     collect(replace(unit, key=(9,), dynamics=(("gravity", 3.0),)))
     collect(replace(unit, key=(9,), policy=network(12, 3, seed=4).export()))
     assert_same_bits(collect(following(unit, first)), second)
-    oodil.pipeline.collecting._simulators.cache_clear()  # as in a worker that has just started
+    oodil.pipeline.collecting._groups.cache_clear()  # as in a worker that has just started
     assert_same_bits(collect(following(unit, first)), second)
     assert_same_bits(collect(unit), first)
 
@@ -162,3 +163,17 @@ def test_unfinished_episodes_keep_their_age_and_return(idle_policy):
     assert second.rollout.truncated.sum() == 1
     total = first.rollout.env_rewards.sum() + second.rollout.env_rewards[:400].sum()
     np.testing.assert_allclose(second.rollout.episode_returns, [total])
+
+
+def test_every_group_keeps_its_simulators_however_many_there_are(unit, monkeypatch):
+    made = []
+
+    def make(*arguments):
+        made.append(arguments)
+        return make_batch(*arguments)
+
+    monkeypatch.setattr(oodil.pipeline.collecting, "make_batch", make)
+    for _ in range(2):
+        for group in range(40):
+            collect(replace(unit, num_simulators=1, num_steps=1, group=group, dynamics=(("gravity", 9.5),)))
+    assert len(made) == 40
