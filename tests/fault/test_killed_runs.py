@@ -26,8 +26,8 @@ def start(run_dir: Path, workers: int) -> LiveRun:
     ("stage", "job", "iteration", "workers", "workers_after"),
     [
         ("clustering", "clustering", 7, 2, 1),
-        ("transferability", "cluster-1", 9, 2, 0),
-        ("transferability", "cluster-0", 20, 0, 2),
+        ("imitators", "cluster-1", 9, 2, 0),
+        ("imitators", "cluster-0", 20, 0, 2),
         ("imitation", "imitation", 17, 1, 4),
     ],
 )
@@ -56,7 +56,7 @@ def test_kill_the_orchestrator_alone(undisturbed: dict[str, str], tmp_path: Path
 @pytest.mark.parametrize(
     ("stage", "job", "victim"),
     [
-        ("transferability", "cluster-0", "transferability-cluster-0"),
+        ("imitators", "cluster-0", "imitators-cluster-0"),
         ("imitation", "imitation", "imitation-imitation"),
         ("imitation", "imitation", "imitation-rollout-worker-1"),
     ],
@@ -74,7 +74,7 @@ def test_kill_one_child(undisturbed: dict[str, str], tmp_path: Path, stage: str,
 
 def test_kill_the_fork_server(undisturbed: dict[str, str], tmp_path: Path) -> None:
     live = start(tmp_path / "run", 2)
-    for stage, job in (("transferability", "cluster-0"), ("imitation", "imitation")):
+    for stage, job in (("imitators", "cluster-0"), ("imitation", "imitation")):
         wait_for(has_checkpoint(tmp_path / "run", stage, job, 4), "checkpoint")
         live.fork_server().kill()
     code, output = live.finish()

@@ -137,7 +137,7 @@ def test_a_node_dies_in_the_middle_of_a_run(tmp_path: Path, cluster: Cluster) ->
     runs = {name: open_run(tmp_path / name, config) for name in ("inline", "ray")}
     walk(runs["inline"], stages(config), LocalEngine(0))
     second = cluster.worker_nodes
-    checkpoints = runs["ray"].directory.path / "checkpoints" / "transferability"
+    checkpoints = runs["ray"].directory.path / "checkpoints" / "imitators"
 
     def kill() -> None:
         wait_until(lambda: any(checkpoints.glob("*/*")), timeout_s=120)
