@@ -10,7 +10,7 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
-from oodil.orchestrator import open_run, walk
+from oodil.orchestrator import execute, open_run
 from oodil.pipeline.artifacts import read_artifact
 from oodil.pipeline.collecting import InlineRollouts
 from oodil.pipeline.errors import ConfigError, UnusableEnvironmentError
@@ -135,7 +135,7 @@ def test_a_node_dies_in_the_middle_of_a_run(tmp_path: Path, cluster: Cluster) ->
     """The whole pipeline, with the second node killed while the cluster jobs run: the same artifacts as inline."""
     config = load_config(MICRO, [])
     runs = {name: open_run(tmp_path / name, config) for name in ("inline", "ray")}
-    walk(runs["inline"], stages(config), LocalEngine(0))
+    execute(runs["inline"], stages(config), LocalEngine(0))
     second = cluster.worker_nodes
     checkpoints = runs["ray"].directory.path / "checkpoints" / "imitators"
 
@@ -145,7 +145,7 @@ def test_a_node_dies_in_the_middle_of_a_run(tmp_path: Path, cluster: Cluster) ->
 
     killer = threading.Thread(target=kill)
     killer.start()
-    walk(runs["ray"], stages(config), RayEngine())
+    execute(runs["ray"], stages(config), RayEngine())
     killer.join()
     assert len([node for node in ray.nodes() if node["Alive"]]) == 1
     hashes = [[run.artifact(stage.name).sha256 for stage in stages(config)] for run in runs.values()]
