@@ -330,7 +330,7 @@ class RuntimeConfig(_Section):
     job_timeout_s: PositiveFloat = 600.0
     """Seconds without any progress after which a job counts as hung, is killed and started again."""
     max_attempts: PositiveInt = 3
-    """Starts of a job before it counts as failed."""
+    """Attempts at a job, in a row, that get no further than one before, until it counts as failed."""
     max_worker_restarts: PositiveInt = 20
     """Restarts of rollout workers in one stage before it counts as failed."""
     restart_delay_s: float = Field(default=0.5, ge=0.0)

@@ -189,7 +189,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class Rollout:
-    """Experience of one env group under exactly one policy version."""
+    """Experience of G simulators, those of one env group, under exactly one policy version."""
 
     policy_version: int
     observations: NDArray[np.float32]
@@ -213,28 +213,8 @@ class Rollout:
 
 
 @dataclass(frozen=True)
-class TransitionBatch:
+class TransitionBatch(Rollout):
     """What one update learns from: the rollouts of all env groups, their G simulators side by side in group order."""
-
-    policy_version: int
-    observations: NDArray[np.float32]
-    """(T, G, S)"""
-    next_observations: NDArray[np.float32]
-    """(T, G, S), before any reset."""
-    actions: NDArray[np.float32]
-    """(T, G, A)"""
-    log_probs: NDArray[np.float32]
-    """(T, G) under the policy that acted."""
-    terminated: NDArray[np.bool_]
-    """(T, G)"""
-    truncated: NDArray[np.bool_]
-    """(T, G)"""
-    env_rewards: NDArray[np.float64]
-    """(T, G); only experts learn from it."""
-    episode_returns: NDArray[np.float64]
-    """(E,) true returns of the episodes that ended; evaluation only."""
-    episode_lengths: NDArray[np.int64]
-    """(E,)"""
 
     @classmethod
     def of(cls, rollouts: Sequence[Rollout]) -> "TransitionBatch":

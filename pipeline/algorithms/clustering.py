@@ -60,7 +60,7 @@ def moved_centers(centers: Tensor, counts: Tensor, features: Tensor, labels: Ten
 
 
 @dataclass(frozen=True)
-class Labelling:
+class Labeling:
     """What a cluster model says about N demonstrations."""
 
     labels: NDArray[np.int32]
@@ -87,7 +87,7 @@ class ClusterModel:
     """(S,) multiplied afterwards."""
 
     @torch.no_grad()
-    def label(self, demonstrations: Demonstrations, draws: int, root_seed: int) -> Labelling:
+    def label(self, demonstrations: Demonstrations, draws: int, root_seed: int) -> Labeling:
         """Label each demonstration by the center nearest to the mean feature of ``draws`` sub-trajectories of it.
 
         Raises DataError when the states have another dimension than those of the training set.
@@ -101,7 +101,7 @@ class ClusterModel:
         features = _encode_all(self.encoder, subtrajectories, draws, derive_key(root_seed, "clustering", "label"))
         mean = normalize(features.mean(0), dim=-1)
         labels = assign(mean, self.centers).numpy().astype(np.int32)
-        return Labelling(labels, mean.numpy(), _stability(features, mean, self.centers))
+        return Labeling(labels, mean.numpy(), _stability(features, mean, self.centers))
 
     def arrays(self) -> dict[str, NDArray]:
         """Return everything by name, for a file; `from_arrays` is the inverse."""

@@ -17,7 +17,7 @@ from oodil.pipeline.stage import JobContext, JobStoppedError, Run, Stage, regist
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 
 if TYPE_CHECKING:
-    from oodil.pipeline.algorithms.clustering import ContrastiveClustering, Labelling
+    from oodil.pipeline.algorithms.clustering import ContrastiveClustering, Labeling
 
 
 class ClusteringStage(Stage):
@@ -48,10 +48,10 @@ class ClusteringStage(Stage):
             clustering = ContrastiveClustering(demonstrations, run.config.clustering, run.config.seed)
             self._train(clustering, run, job, context)
             model = clustering.model()
-            labelling = model.label(demonstrations, run.config.clustering.label_draws, run.config.seed)
+            labeling = model.label(demonstrations, run.config.clustering.label_draws, run.config.seed)
             shortened = model.sampling.num_shortened(demonstrations.lengths)
-            found = diagnostics(labelling, demonstrations, len(model.centers), shortened)
-        assignment = Assignment(labelling.labels, labelling.features)
+            found = diagnostics(labeling, demonstrations, len(model.centers), shortened)
+        assignment = Assignment(labeling.labels, labeling.features)
         return assignment.files() | cluster_model_files(model.arrays()) | found.files()
 
     def _train(self, clustering: "ContrastiveClustering", run: Run, job: str, context: JobContext) -> None:
@@ -74,21 +74,21 @@ class ClusteringStage(Stage):
 
 
 def diagnostics(
-    labelling: "Labelling", demonstrations: Demonstrations, num_clusters: int, shortened_subtrajectories: int = 0
+    labeling: "Labeling", demonstrations: Demonstrations, num_clusters: int, shortened_subtrajectories: int = 0
 ) -> ClusterDiagnostics:
     """Return what is said about an assignment; what needs the sources is for reporting only."""
     from sklearn.metrics import calinski_harabasz_score, silhouette_score
 
-    sizes = np.bincount(labelling.labels, minlength=num_clusters)
+    sizes = np.bincount(labeling.labels, minlength=num_clusters)
     silhouette = calinski_harabasz = None
-    if 2 <= int((sizes > 0).sum()) < len(labelling.labels):
-        silhouette = float(silhouette_score(labelling.features, labelling.labels, metric="cosine"))
-        calinski_harabasz = float(calinski_harabasz_score(labelling.features, labelling.labels))
-    table = contingency(labelling.labels, demonstrations.sources, num_clusters, len(demonstrations.source_labels))
+    if 2 <= int((sizes > 0).sum()) < len(labeling.labels):
+        silhouette = float(silhouette_score(labeling.features, labeling.labels, metric="cosine"))
+        calinski_harabasz = float(calinski_harabasz_score(labeling.features, labeling.labels))
+    table = contingency(labeling.labels, demonstrations.sources, num_clusters, len(demonstrations.source_labels))
     return ClusterDiagnostics(
         num_clusters=num_clusters,
         cluster_sizes=tuple(sizes.tolist()),
-        label_stability=labelling.stability,
+        label_stability=labeling.stability,
         silhouette=silhouette,
         calinski_harabasz=calinski_harabasz,
         purity=purity(table),

@@ -12,7 +12,7 @@ from sklearn.metrics import calinski_harabasz_score, silhouette_score
 from oodil.pipeline.algorithms.clustering import (
     ClusterModel,
     ContrastiveClustering,
-    Labelling,
+    Labeling,
     assign,
     center_loss,
     moved_centers,
@@ -96,16 +96,16 @@ def test_three_dynamics_are_told_apart_with_five_clusters():
     clustering = ContrastiveClustering(demonstrations, config, root_seed=0)
     while clustering.iteration < clustering.num_iterations:
         clustering.update()
-    labelling = clustering.model().label(demonstrations, draws=5, root_seed=0)
+    labeling = clustering.model().label(demonstrations, draws=5, root_seed=0)
 
-    report = diagnostics(labelling, demonstrations, 5)
+    report = diagnostics(labeling, demonstrations, 5)
     assert report.purity == 1.0
     assert report.label_stability > 0.7  # a mode may be split in two, and then a draw falls on either side
-    np.testing.assert_allclose(np.linalg.norm(labelling.features, axis=1), 1, rtol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(labeling.features, axis=1), 1, rtol=1e-5)
     # The frozen model finds the same dynamics in demonstrations that it has never seen.
     new = three_dynamics((10, 10, 10), seed=1)
     rebuilt = ClusterModel.from_arrays(clustering.model().arrays())
-    owner = contingency(labelling.labels, demonstrations.sources, 5, 3).argmax(axis=0)
+    owner = contingency(labeling.labels, demonstrations.sources, 5, 3).argmax(axis=0)
     found = rebuilt.label(new, draws=5, root_seed=0)
     assert (owner[found.labels] == new.sources).mean() > 0.9
 
@@ -115,10 +115,10 @@ def test_a_model_without_training_data_for_a_center_leaves_that_cluster_empty():
     model = ContrastiveClustering(demonstrations, ClusteringConfig(**SMALL, num_clusters=3), 0).model()
     features = model.label(demonstrations, draws=1, root_seed=0).features
     far = torch.stack((torch.from_numpy(features.mean(axis=0)), torch.full((16,), 9.0)))
-    labelling = ClusterModel(
+    labeling = ClusterModel(
         model.encoder, far, torch.ones(2), model.sampling, model.state_mean, model.state_scale
     ).label(demonstrations, draws=2, root_seed=0)
-    report = diagnostics(labelling, demonstrations, 2)
+    report = diagnostics(labeling, demonstrations, 2)
     assert report.cluster_sizes == (9, 0)
     assert (report.non_empty_clusters, report.silhouette, report.calinski_harabasz) == (1, None, None)
 
@@ -127,7 +127,7 @@ def test_diagnostics_by_hand():
     demonstrations = three_dynamics((2, 3, 1))
     features = np.array([[1, 0], [1, 0.1], [0, 1], [0.1, 1], [0, 1], [0.9, 0]], np.float32)
     labels = np.array([0, 0, 3, 3, 3, 0], np.int32)
-    report = diagnostics(Labelling(labels, features, stability=0.75), demonstrations, num_clusters=4)
+    report = diagnostics(Labeling(labels, features, stability=0.75), demonstrations, num_clusters=4)
     assert report.contingency == ((2, 0, 0, 0), (0, 0, 0, 3), (1, 0, 0, 0))
     assert report.purity == pytest.approx(5 / 6)
     assert report.cluster_sizes == (3, 0, 0, 3)
