@@ -100,7 +100,7 @@ def refuse_to_replace(run: Run, force: Collection[str]) -> None:
             replaced.add(stage.name)
         elif stage.name not in replaced:
             state = state_of(stage, run)
-            if state.state == "stale" and not state.reason.startswith("its input"):
+            if state.state == "stale" and not state.follows_input:
                 raise ConfigError(
                     f"{run.directory.path}: {stage.name} is finished with other settings ({state.reason}); "
                     f"--force {stage.name} replaces it and what follows from it, another --run-dir keeps both"

@@ -157,12 +157,12 @@ class Imitator:
 
     def files(self) -> Files:
         """Return the artifact's content."""
-        return {_POLICY: encode_arrays(self.policy.arrays()), _DISCRIMINATOR: encode_arrays(self.discriminator)}
+        return {_POLICY: encode_arrays(self.policy.arrays())} | discriminator_file(self.discriminator)
 
     @classmethod
     def load(cls, artifact: Artifact) -> Self:
         """Read an artifact."""
-        return cls(_policy(artifact), artifact.arrays(_DISCRIMINATOR))
+        return cls(_policy(artifact), load_discriminator(artifact))
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,6 @@ from oodil.pipeline.results import (
     Evaluation,
     LearningCurve,
     Policy,
-    TrainedImitators,
     Transferability,
 )
 from oodil.pipeline.stage import Run, StageState, state_of
@@ -41,7 +40,8 @@ class RunResults:
             state = state_of(stage, run)
             unusable = [name for name in stage.inputs if self.states[name].state in ("stale", "damaged")]
             if state.state == "done" and unusable:
-                state = StageState("stale", f"its input {unusable[0]} is {self.states[unusable[0]].state}")
+                reason = f"its input {unusable[0]} is {self.states[unusable[0]].state}"
+                state = StageState("stale", reason, follows_input=True)
             self.states[stage.name] = state
 
     @property
@@ -159,16 +159,8 @@ class RunResults:
 
     def env_steps(self) -> dict[str, int]:
         """Return the environment steps that each finished stage took; stages that take none are left out."""
-        steps: dict[str, int] = {}
-        for name in self.states:
-            if not self.is_done(name):
-                continue
-            if name == "imitators":
-                steps[name] = TrainedImitators.load(self.artifact(name)).env_steps
-            elif name in {weighting.name for weighting in self.weightings}:
-                steps[name] = self.weighting(name).env_steps
-            elif name in {policy.name for policy in self.policies}:
-                steps[name] = self.policy(name).env_steps
+        finished = [stage for stage in stages(self.config) if self.is_done(stage.name)]
+        steps = {stage.name: stage.env_steps(self.run) for stage in finished}
         return {name: count for name, count in steps.items() if count}
 
     def seconds(self) -> dict[str, float]:

@@ -99,6 +99,10 @@ class Stage(ABC):
         """Return the stage's files, made of its jobs' artifacts; None when the only job's artifact is the stage's."""
         return None
 
+    def env_steps(self, run: Run) -> int:
+        """Return the environment steps that its finished artifact took; 0 for a stage without a simulator."""
+        return 0
+
     def origin(self, run: Run) -> dict[str, Any]:
         """Return what names the stage's artifact: stage, version, seed, settings, and the content of its inputs."""
         return {
@@ -157,6 +161,8 @@ class StageState:
     """What is damaged, or the field that differs."""
     artifact: Artifact | None = None
     """There if it is done."""
+    follows_input: bool = False
+    """Whether it is stale only because an input was replaced, is missing, or cannot be used itself."""
 
 
 def state_of(stage: Stage, run: Run) -> StageState:
@@ -168,10 +174,11 @@ def state_of(stage: Stage, run: Run) -> StageState:
             return StageState("partial" if run.directory.has_begun(stage.name) else "pending")
         missing = [name for name in stage.inputs if read_artifact(run.directory.stage(name)) is None]
         if missing:
-            return StageState("stale", f"its input {missing[0]} is missing")
+            return StageState("stale", f"its input {missing[0]} is missing", follows_input=True)
         origin = stage.origin(run)
         if not artifact.made_from(origin):
-            return StageState("stale", origin_difference(artifact.origin, origin))
+            inputs_alone = artifact.made_from(origin | {"inputs": artifact.origin.get("inputs")})
+            return StageState("stale", origin_difference(artifact.origin, origin), follows_input=inputs_alone)
         artifact.verify()
     except DamagedArtifactError as error:
         return StageState("damaged", str(error))

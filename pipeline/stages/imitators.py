@@ -97,6 +97,10 @@ class ImitatorsStage(Stage):
             sha256={job: run.job_artifact(self.name, job).sha256 for job in jobs},
         ).files()
 
+    def env_steps(self, run: Run) -> int:
+        """Return the environment steps of all imitators together."""
+        return TrainedImitators.load(run.artifact(self.name)).env_steps
+
 
 def cluster_of(job: str) -> int:
     """Return the id of the cluster that a job is about."""

@@ -47,6 +47,10 @@ class PolicyStage(Stage):
         """Return the section and the imitator's environment."""
         return config.imitation.model_dump(mode="json") | {"environment": config.environment.model_dump()}
 
+    def env_steps(self, run: Run) -> int:
+        """Return the environment steps of the training."""
+        return Policy.load(run.artifact(self.name)).env_steps
+
     def weights(self, run: Run) -> NDArray[np.float64]:
         """Return (N,) weights of the demonstrations."""
         if self.weighting is None:

@@ -19,6 +19,10 @@ class Weighting(Stage):
         """Return what it says of the run's demonstrations. Raises NotFinishedError."""
         return Transferability.load(run.artifact(self.name))
 
+    def env_steps(self, run: Run) -> int:
+        """Return the environment steps that the scores took."""
+        return self.load(run).env_steps
+
     def rule(self, config: RunConfig) -> str:
         """Say, for the report, how a demonstration's weight follows from its score."""
         return "a demonstration is drawn for imitation in proportion to its score"
