@@ -17,26 +17,14 @@ pytestmark = pytest.mark.timeout(240)
 
 SCRIPT = """
 import sys
-from pathlib import Path
 import numpy, torch
 from threadpoolctl import threadpool_info
-from oodil.orchestrator import open_run
-from oodil.pipeline.loading import load_config
-from oodil.pipeline.stages import stages
-from oodil.workers.local_engine import LocalEngine
-from oodil.pipeline.artifacts import write_artifact
+import oodil
 
 threads = int(sys.argv[2])
 assert torch.get_num_threads() == threads
 before = {pool["filepath"]: pool["num_threads"] for pool in threadpool_info()}
-config = load_config(Path(sys.argv[1]), [])
-run = open_run(Path(sys.argv[3]), config)
-for stage in stages(config):
-    outcome = LocalEngine(0).run_jobs(stage, run, stage.jobs(run), lambda event: None, lambda: False)
-    assert not outcome.failed, outcome
-    files = stage.combine(run)
-    if files is not None:
-        write_artifact(run.directory.stage(stage.name), stage.origin(run), files)
+oodil.run(sys.argv[1], workers=0, run_dir=sys.argv[3])
 assert torch.get_num_threads() == threads
 after = {pool["filepath"]: pool["num_threads"] for pool in threadpool_info()}
 assert threads in before.values() and before.items() <= after.items(), (before, after)
