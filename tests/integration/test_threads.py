@@ -20,11 +20,24 @@ import sys
 import numpy, torch
 from threadpoolctl import threadpool_info
 import oodil
+from oodil.workers.reports import Progress
 
 threads = int(sys.argv[2])
 assert torch.get_num_threads() == threads
 before = {pool["filepath"]: pool["num_threads"] for pool in threadpool_info()}
-oodil.run(sys.argv[1], workers=0, run_dir=sys.argv[3])
+seen = set()
+
+
+class Watch(oodil.Observer):
+    # Inline, a job reports from where it computes.
+    def event(self, event):
+        if isinstance(event.report, Progress):
+            seen.add(torch.get_num_threads())
+            seen.update(pool["num_threads"] for pool in threadpool_info())
+
+
+oodil.run(sys.argv[1], workers=0, run_dir=sys.argv[3], observer=Watch())
+assert seen == {1}, seen
 assert torch.get_num_threads() == threads
 after = {pool["filepath"]: pool["num_threads"] for pool in threadpool_info()}
 assert threads in before.values() and before.items() <= after.items(), (before, after)
