@@ -5,6 +5,7 @@ demonstrations never meet, on a page or in a script.
 """
 
 import json
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -80,9 +81,9 @@ class RunResults:
             )
         return state.artifact
 
-    @property
+    @cached_property
     def demonstrations(self) -> Demonstrations:
-        """What is imitated, under the labels of the configuration."""
+        """What is imitated, under the labels of the configuration; read once, since all figures ask for it."""
         self.artifact("demonstrations")
         return load_demonstrations(self.run)
 

@@ -33,13 +33,13 @@ def encode_demonstrations(demonstrations: Demonstrations, environment_id: str) -
     return safetensors.numpy.save(arrays, metadata={_HEADER: json.dumps(header)})
 
 
-def read_demonstrations(path: Path) -> tuple[Demonstrations, str]:
+def read_demonstrations(path: str | Path) -> tuple[Demonstrations, str]:
     """Return the demonstrations of a file and the id of the environment they are from.
 
     ``observations`` and ``offsets`` are required; without ``sources`` all are from one source, without ``terminated``
     none ended in failure. Raises DataError that names the file and what is wrong with it.
     """
-    return decode_demonstrations(read_file(path), str(path))
+    return decode_demonstrations(read_file(Path(path)), str(path))
 
 
 def read_file(path: Path) -> bytes:

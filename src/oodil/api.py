@@ -33,7 +33,7 @@ def run(
     """Run the pipeline; what is finished is reused, what was interrupted goes on.
 
     It works in a notebook, in a thread and in a script without a ``__main__`` guard; it prints nothing, and handles no
-    signal. The report is not written; see `oodil.pipeline.report.write_report`.
+    signal. The report is not written; `oodil.write_report` does that.
 
     Args:
         config: a YAML file, the name of a configuration that comes with oodil, plain values or a `RunConfig`.

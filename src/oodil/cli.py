@@ -378,8 +378,9 @@ def _execute(opened: "Run", chosen: "list[Stage]", engine: "Engine", force: list
     try:
         _show_execution(opened, chosen, engine, force)
     finally:
-        path = write_report(opened)
-    print_summary(RunResults(opened), path)
+        results = RunResults(opened)
+        path = write_report(results)
+    print_summary(results, path)
 
 
 def _show_execution(opened: "Run", chosen: "list[Stage]", engine: "Engine", force: list[str] | None = None) -> None:
