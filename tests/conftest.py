@@ -14,9 +14,11 @@ import pytest  # noqa: E402
 import torch  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
+import oodil  # noqa: E402
 from oodil.pipeline.algorithms.networks import PolicyNetwork  # noqa: E402
 from oodil.pipeline.data import Demonstrations, Rollout  # noqa: E402
 from oodil.pipeline.policy import GaussianPolicy  # noqa: E402
+from tests.runs import MICRO  # noqa: E402
 
 torch.set_num_threads(1)
 # A busy machine is no defect, and the gate must give the same answer twice.
@@ -31,6 +33,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if {"integration", "fault"} & set(item.path.parts):
             item.add_marker(pytest.mark.slow)
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The SHA-256 of each stage of the micro run, naive GAIL included, that nothing disturbed, made in this process."""
+    path = tmp_path_factory.mktemp("undisturbed") / "run"
+    described = oodil.run(MICRO, ["baselines=[naive_gail]"], workers=0, run_dir=path).describe()
+    return {name: stage["sha256"] for name, stage in described["stages"].items()}
 
 
 @pytest.fixture

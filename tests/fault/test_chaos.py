@@ -7,7 +7,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.runs import MICRO, LiveRun, artifacts, nothing_left, run
+from tests.runs import MICRO, LiveRun, artifacts, nothing_left
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -16,9 +16,8 @@ KILL_EVERY_S = 4.0
 TIMES = 8
 
 
-def test_a_run_survives_a_killer(tmp_path: Path) -> None:
+def test_a_run_survives_a_killer(undisturbed: dict[str, str], tmp_path: Path) -> None:
     settings = ("runtime.max_attempts=100", "baselines=[naive_gail]")
-    run("run", str(MICRO), *settings, "--run-dir", str(tmp_path / "calm"), "--workers", "2")
     chosen = random.Random(0)
     live = LiveRun("run", str(MICRO), *settings, "--run-dir", str(tmp_path / "run"), "--workers", "2")
     killed = []
@@ -41,4 +40,4 @@ def test_a_run_survives_a_killer(tmp_path: Path) -> None:
     assert code == 0, output
     nothing_left(live)
     assert len(killed) >= 4, "it was over before much could be killed"
-    assert artifacts(tmp_path / "run") == artifacts(tmp_path / "calm")
+    assert artifacts(tmp_path / "run") == undisturbed

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runs import MICRO, LiveRun, artifacts, run
+from tests.runs import MICRO, LiveRun, artifacts, run, without_baselines
 
 pytestmark = [pytest.mark.root, pytest.mark.timeout(300)]
 SETTINGS = ("baselines=[]", "runtime.max_attempts=1")
@@ -24,12 +24,11 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
-def test_a_full_disk_stops_the_run_and_a_resumed_one_goes_on(small_disk: Path, tmp_path: Path) -> None:
-    run("run", str(MICRO), *SETTINGS, "--run-dir", str(tmp_path / "roomy"), "--workers", "1")
+def test_a_full_disk_stops_the_run_and_a_resumed_one_goes_on(undisturbed: dict[str, str], small_disk: Path) -> None:
     run_dir = small_disk / "run"
     code, output = LiveRun("run", str(MICRO), *SETTINGS, "--run-dir", str(run_dir), "--workers", "1").finish()
     assert code == 1, output
     assert "No space left on device" in output and "oodil resume" in output
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
     run("resume", str(run_dir), "--workers", "1")
-    assert artifacts(run_dir) == artifacts(tmp_path / "roomy")
+    assert artifacts(run_dir) == without_baselines(undisturbed)

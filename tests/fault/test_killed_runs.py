@@ -5,17 +5,19 @@ from pathlib import Path
 
 import pytest
 
-from tests.runs import MICRO, LiveRun, artifacts, has_checkpoint, interrupt, nothing_left, run, wait_for
+from tests.runs import (
+    MICRO,
+    LiveRun,
+    artifacts,
+    has_checkpoint,
+    interrupt,
+    nothing_left,
+    run,
+    wait_for,
+    without_baselines,
+)
 
 pytestmark = pytest.mark.timeout(600)
-
-
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The hashes of a run to which nothing happens."""
-    run_dir = tmp_path_factory.mktemp("undisturbed") / "run"
-    run("run", str(MICRO), "--run-dir", str(run_dir), "--workers", "2")
-    return artifacts(run_dir)
 
 
 def start(run_dir: Path, workers: int) -> LiveRun:
@@ -41,7 +43,7 @@ def test_kill_all_then_resume(
     output = run("resume", str(tmp_path / "run"), "--workers", str(workers_after))
     begun = next(line for line in output.splitlines() if line.startswith(f"▶ {stage}"))
     assert "resumed from checkpoint" in begun
-    assert artifacts(tmp_path / "run") == undisturbed
+    assert artifacts(tmp_path / "run") == without_baselines(undisturbed)
 
 
 def test_kill_the_orchestrator_alone(undisturbed: dict[str, str], tmp_path: Path) -> None:
@@ -50,7 +52,7 @@ def test_kill_the_orchestrator_alone(undisturbed: dict[str, str], tmp_path: Path
     live.process.kill()
     nothing_left(live)
     run("resume", str(tmp_path / "run"), "--workers", "2")
-    assert artifacts(tmp_path / "run") == undisturbed
+    assert artifacts(tmp_path / "run") == without_baselines(undisturbed)
 
 
 @pytest.mark.parametrize(
@@ -69,7 +71,7 @@ def test_kill_one_child(undisturbed: dict[str, str], tmp_path: Path, stage: str,
     assert code == 0, output
     assert "SIGKILL" in output
     nothing_left(live)
-    assert artifacts(tmp_path / "run") == undisturbed
+    assert artifacts(tmp_path / "run") == without_baselines(undisturbed)
 
 
 def test_kill_the_fork_server(undisturbed: dict[str, str], tmp_path: Path) -> None:
@@ -81,7 +83,7 @@ def test_kill_the_fork_server(undisturbed: dict[str, str], tmp_path: Path) -> No
     assert code == 0, output
     assert "its fork server died" in output
     nothing_left(live)
-    assert artifacts(tmp_path / "run") == undisturbed
+    assert artifacts(tmp_path / "run") == without_baselines(undisturbed)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -99,4 +101,4 @@ def test_an_interrupt_checkpoints_and_stops(
     assert "oodil resume" in output
     nothing_left(live)
     run("resume", str(tmp_path / "run"), "--workers", "1")
-    assert artifacts(tmp_path / "run") == undisturbed
+    assert artifacts(tmp_path / "run") == without_baselines(undisturbed)

@@ -12,7 +12,18 @@ from pathlib import Path
 
 import pytest
 
-from tests.runs import MICRO, PATIENCE_S, ROOT, LiveRun, artifacts, has_checkpoint, nothing_left, run, wait_for
+from tests.runs import (
+    MICRO,
+    PATIENCE_S,
+    ROOT,
+    LiveRun,
+    artifacts,
+    has_checkpoint,
+    nothing_left,
+    run,
+    wait_for,
+    without_baselines,
+)
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -57,8 +68,7 @@ class RunInTerminal(LiveRun):
 
 
 @pytest.mark.parametrize("times", [1, 2])
-def test_ctrl_c(tmp_path: Path, times: int) -> None:
-    run("run", str(MICRO), "--run-dir", str(tmp_path / "whole"), "--workers", "0")
+def test_ctrl_c(undisturbed: dict[str, str], tmp_path: Path, times: int) -> None:
     live = RunInTerminal("run", str(MICRO), "--run-dir", str(tmp_path / "stopped"), "--workers", "2")
     wait_for(has_checkpoint(tmp_path / "stopped", "imitation", "imitation", 2), "checkpoint")
     if times == 2:
@@ -76,4 +86,4 @@ def test_ctrl_c(tmp_path: Path, times: int) -> None:
     assert "oodil resume" in shown
     nothing_left(live)
     run("resume", str(tmp_path / "stopped"), "--workers", "1")
-    assert artifacts(tmp_path / "stopped") == artifacts(tmp_path / "whole")
+    assert artifacts(tmp_path / "stopped") == without_baselines(undisturbed)

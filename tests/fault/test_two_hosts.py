@@ -13,7 +13,7 @@ import pytest
 
 from oodil.workers.channels import new_key_pair
 from oodil.workers.keys import create_learner_keys, create_worker_keys
-from tests.runs import MICRO, ROOT, LiveRun, artifacts, has_checkpoint, nothing_left, run, wait_for
+from tests.runs import MICRO, ROOT, LiveRun, artifacts, has_checkpoint, nothing_left, wait_for, without_baselines
 
 pytestmark = [pytest.mark.root, pytest.mark.timeout(300)]
 
@@ -62,9 +62,8 @@ def hosts() -> Iterator[Hosts]:
         ip("netns", "del", made.lab)
 
 
-def test_the_cable_is_pulled_and_plugged_in_again(hosts: Hosts, tmp_path: Path) -> None:
+def test_the_cable_is_pulled_and_plugged_in_again(undisturbed: dict[str, str], hosts: Hosts, tmp_path: Path) -> None:
     """The only local rollout worker is frozen, so the final training lives on what comes over the cable."""
-    run("run", str(MICRO), "--workers", "0", "--run-dir", str(tmp_path / "alone"))
     keys = tmp_path / "keys"
     create_learner_keys(keys, new_key_pair)
     address, run_dir = f"tcp://{LAB}:5555", tmp_path / "joined"
@@ -89,4 +88,4 @@ def test_the_cable_is_pulled_and_plugged_in_again(hosts: Hosts, tmp_path: Path) 
         remote.wait(timeout=30)
     assert code == 0, output
     nothing_left(live)
-    assert artifacts(run_dir) == artifacts(tmp_path / "alone")
+    assert artifacts(run_dir) == without_baselines(undisturbed)
