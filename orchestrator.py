@@ -110,13 +110,6 @@ def refuse_to_replace(run: Run, force: Collection[str]) -> None:
 def check_inputs(config: RunConfig) -> None:
     """Refuse, before any work, an environment that cannot be made and demonstrations that cannot fit it."""
     spec = check_environment(config.environment.id, config.environment.dynamics)
-    for name in ("transferability", "imitation"):
-        ignored = getattr(config, name).gail.discriminator.ignored
-        if not set(ignored) < set(range(spec.observation_dim)):
-            raise ConfigError(
-                f"{name}.gail.discriminator.ignored is {list(ignored)}; states have the dimensions 0 to "
-                f"{spec.observation_dim - 1}, of which at least one must be seen"
-            )
     for source in config.demonstrations.sources:
         check_environment(config.environment.id, source.dynamics)
     check_demonstrations(config, spec.observation_dim)

@@ -44,6 +44,12 @@ def arguments_of(doc: str | None) -> argparse.ArgumentParser:
     return parser
 
 
+def seeds_of(text: str) -> range:
+    """Return the seeds that ``10-14`` or ``3`` stands for."""
+    first, _, last = text.partition("-")
+    return range(int(first), int(last or first) + 1)
+
+
 def circumstances() -> dict[str, Any]:
     """Return what figures depend on; ask before anything is measured, since the load is part of it."""
     return {"machine": machine(), "versions": library_versions()}

@@ -1,123 +1,178 @@
-"""How much experience GAIL needs: ten demonstrations of gravity 9.8, an imitator under gravity 12.0, five seeds.
+"""How much experience GAIL needs from one reproducible source, in every environment, with one setting for all.
 
-For every seed: environment steps and seconds until the deterministic policy first reaches a return of 2,900, and the
-return at the end of the budget. Run ``python benchmarks/gail_reference.py --json FILE``; ``--setting official`` takes
-the constants of the method's released code instead of the defaults, ``ppo`` the other policy optimizer,
-``wide`` and ``cheap`` what would be faster per step.
+For every seed: the true return of mean and of sampled actions along the training, environment steps until mean actions
+first reach the task's target, and the share of final episodes that reach it. Constants are chosen with ``--dynamics
+choosing``, imitators that no table uses, and reported with ``--dynamics reported``. ``--set KEY=VALUE`` changes a field
+of the training, such as ``discriminator.gradient_penalty=0`` or ``policy_optimizer.kind=ppo``.
+
+Run ``python benchmarks/gail_reference.py hopper walker2d --seeds 10-14 --dynamics reported --json FILE``.
 """
 
 import multiprocessing
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
-from common import UNUSED, Quiet, arguments_of, circumstances, one_thread, save
+from common import UNUSED, Quiet, arguments_of, circumstances, one_thread, save, seeds_of
 from numpy.typing import NDArray
 
 from oodil.pipeline.algorithms.gail import imitator
+from oodil.pipeline.artifacts import encode_arrays
 from oodil.pipeline.config import EnvironmentConfig, GailConfig
+from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import environment_spec
 from oodil.pipeline.evaluation import evaluate
+from oodil.pipeline.loading import apply_override
 from oodil.pipeline.seeding import derive_key
 from oodil.pipeline.stages.demonstrations import collect_demonstrations
 from oodil.pipeline.stages.experts import load_expert
 from oodil.pipeline.training import Probe, train
 
-ENV_ID = "oodil/Hopper-v0"
-EXPERT = Path(__file__).parents[1] / "configs" / "experts" / "hopper-gravity-9.8"
-IMITATOR, DEMONSTRATOR = {"gravity": 12.0}, {"gravity": 9.8}
-TARGET_RETURN = 2900.0
-EVALUATION_INTERVAL = 50_000
-SETTINGS: dict[str, dict[str, Any]] = {
-    "default": {},
-    "official": {
-        "normalize_observations": False,
-        "policy_optimizer": {"fisher_every": 1},
-        "value": {"learning_rate": 3e-4, "epochs": 1, "minibatch_size": 86},
-        "anneal": False,
-        "lag": 0,
-    },
-    "ppo": {"policy_optimizer": {"kind": "ppo"}},
-    "wide": {"simulators_per_group": 16, "steps_per_rollout": 40},
-    "cheap": {
-        "simulators_per_group": 16,
-        "steps_per_rollout": 40,
-        "policy_optimizer": {"fisher_every": 8},
-        "value": {"epochs": 2},
-    },
-}
+EXPERTS = Path(__file__).parents[1] / "configs" / "experts"
+CURVE_POINTS = 28
+CURVE_EPISODES, FINAL_EPISODES = 8, 100
 
 
-def run_seed(seed: int, config: GailConfig) -> dict[str, Any]:
-    policy, _ = load_expert(EXPERT)
-    source = EnvironmentConfig(id=ENV_ID, dynamics=DEMONSTRATOR)
-    demonstrations, _ = collect_demonstrations(
-        policy,
-        source,
+@dataclass(frozen=True)
+class Task:
+    """One source of demonstrations and an imitator that can reproduce it."""
+
+    env_id: str
+    expert: str
+    demonstrator: dict[str, float]
+    reported: dict[str, float]
+    """The imitator's dynamics that tables use."""
+    choosing: dict[str, float]
+    """The imitator's dynamics that constants are chosen with."""
+    count: int
+    target: float
+    """True return that counts as solved."""
+    total_steps: int
+    minimum_return: float | None = None
+    """Smallest return of a demonstration; without it only full-length episodes count."""
+
+
+TASKS = {
+    "hopper": Task(
+        "oodil/Hopper-v0", "hopper-gravity-9.8", {"gravity": 9.8}, {"gravity": 12.0}, {"gravity": 11.0}, 10, 2900, 700_000
+    ),
+    "walker2d": Task(
+        "oodil/Walker2d-v0", "walker2d-friction-9.9", {"friction": 9.9}, {"friction": 19.9}, {"friction": 15.0}, 50, 2000,
+        1_000_000,
+    ),
+    "half_cheetah": Task(
+        "oodil/HalfCheetah-v0", "half-cheetah-back-0.9", {"front": 1.0, "back": 0.9}, {},
+        {"front": 0.95, "back": 0.95}, 100, 3000, 1_500_000,
+    ),
+    "driving": Task(
+        "oodil/Driving-v0", "hand-written", {"obstacle_1": 0.5, "obstacle_2": 0.25, "speed": 1.0},
+        {"obstacle_1": 0.4, "obstacle_2": 0.25, "speed": 1.0}, {"obstacle_1": 0.3, "obstacle_2": 0.2, "speed": 1.0},
+        50, 0, 1_000_000, -500,
+    ),
+    "panda": Task(
+        "oodil/Panda20Hz-v0", "hand-written", {"joint_1": 0}, {"joint_1": 0, "joint_3": 0}, {"joint_1": 0, "joint_5": 0},
+        140, 500, 500_000, 500,
+    ),
+}  # fmt: skip
+
+
+def demonstrations_of(task: Task, seed: int) -> Demonstrations:
+    """Collect the demonstrations of a task."""
+    return collect_demonstrations(
+        None if task.expert == "hand-written" else load_expert(EXPERTS / task.expert)[0],
+        EnvironmentConfig(id=task.env_id, dynamics=task.demonstrator),
         0,
-        10,
+        task.count,
         seed,
         deterministic=False,
-        full_length_only=True,
-        minimum_return=None,
+        full_length_only=task.minimum_return is None,
+        minimum_return=task.minimum_return,
         context=Quiet(),
-    )
-    spec, weights = environment_spec(ENV_ID, IMITATOR), np.ones(len(demonstrations))
+    )[0]
+
+
+def run_seed(name: str, dynamics: str, seed: int, config: GailConfig, keep: Path | None) -> dict[str, Any]:
+    """Train one imitator."""
+    one_thread()
+    task = TASKS[name]
+    target: dict[str, float] = getattr(task, dynamics)
+    demonstrations = demonstrations_of(task, seed)
+    spec, weights = environment_spec(task.env_id, target), np.ones(len(demonstrations))
     learner = imitator(spec.observation_dim, spec.action_dim, demonstrations, weights, config, seed)
-    seconds: list[float] = []
-    evaluating = 0.0
+    key = derive_key(seed, "benchmark")
+    measuring = 0.0
     started = time.perf_counter()
 
     def measure() -> NDArray[np.float64]:
-        nonlocal evaluating
+        nonlocal measuring
         begun = time.perf_counter()
-        seconds.append(begun - started - evaluating)
-        seen = evaluate(learner.behavior_policy(), ENV_ID, IMITATOR, 8, derive_key(seed, "benchmark"))
-        evaluating += time.perf_counter() - begun
-        return np.array(seen.mean_return)
+        policy = learner.behavior_policy()
+        mean = evaluate(policy, task.env_id, target, CURVE_EPISODES, key)
+        sampled = evaluate(policy, task.env_id, target, CURVE_EPISODES, key, stochastic=True)
+        measuring += time.perf_counter() - begun
+        return np.array([mean.mean_return, sampled.mean_return, float(np.exp(policy.log_std).mean())])
 
-    probe = Probe("return", max(1, config.total_steps // EVALUATION_INTERVAL), measure)
-    environment = EnvironmentConfig(id=ENV_ID, dynamics=IMITATOR)
-    history = train(learner, environment, config, [probe], Quiet(), UNUSED)
-    returns, steps = history.values("return"), history.steps("return")
-    reached = np.flatnonzero(returns >= TARGET_RETURN)
-    first = int(reached[0]) if reached.size else None
+    environment = EnvironmentConfig(id=task.env_id, dynamics=target)
+    history = train(learner, environment, config, [Probe("return", CURVE_POINTS, measure)], Quiet(), UNUSED)
+    seconds = time.perf_counter() - started - measuring
+    steps, curve = history.steps("return"), history.values("return")
+    reached = np.flatnonzero(curve[:, 0] >= task.target)
+    policy = learner.behavior_policy()
+    final = evaluate(policy, task.env_id, target, FINAL_EPISODES, key)
+    if keep:
+        keep.mkdir(parents=True, exist_ok=True)
+        (keep / f"{name}-{dynamics}-{seed}.safetensors").write_bytes(encode_arrays(policy.arrays()))
     return {
+        "task": name,
         "seed": seed,
         "demonstrations_return": float(demonstrations.returns.mean()),
-        "steps_to_target": int(steps[first]) if first is not None else None,
-        "seconds_to_target": seconds[first] if first is not None else None,
-        "final_return": float(returns[-1]),
-        "seconds": seconds[-1],
-        "curve": {"env_steps": steps.tolist(), "return": returns.tolist()},
-    }
+        "steps_to_target": int(steps[reached[0]]) if reached.size else None,
+        "final_return": final.mean_return,
+        "final_share": float((final.returns >= task.target).mean()),
+        "sampled_return": float(curve[-1, 1]),
+        "seconds": round(seconds, 1),
+        "curve": {"env_steps": steps.tolist(), "mean": curve[:, 0].round(1).tolist(),
+                  "sampled": curve[:, 1].round(1).tolist(), "std": curve[:, 2].round(3).tolist()},
+    }  # fmt: skip
 
 
 def main() -> None:
     one_thread()
     parser = arguments_of(__doc__)
-    parser.add_argument("--setting", choices=sorted(SETTINGS), default="default")
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--steps", type=int, default=1_500_000)
+    parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)}; all without one")
+    parser.add_argument("--dynamics", choices=["choosing", "reported"], default="choosing")
+    parser.add_argument("--seeds", type=seeds_of, default=range(5), metavar="A-B")
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="fields of the training")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="write the trained policies to this folder")
     arguments = parser.parse_args()
-    config = GailConfig.model_validate({"total_steps": arguments.steps} | SETTINGS[arguments.setting])
-    found = circumstances()
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(arguments.processes, mp_context=context) as pool:
-        results = list(pool.map(run_seed, range(arguments.seeds), [config] * arguments.seeds))
-    for result in results:
-        print({name: value for name, value in result.items() if name != "curve"})
-    reached = [result["steps_to_target"] or float("inf") for result in results]
-    print(
-        f"{arguments.setting}: median steps to {TARGET_RETURN:,.0f}: {median(reached):,.0f}; mean final return "
-        f"{np.mean([result['final_return'] for result in results]):,.0f}"
-    )
-    found |= {"setting": arguments.setting, "processes": arguments.processes}
-    save(arguments.json, found | {"config": config.model_dump(mode="json"), "seeds": results})
+    found = circumstances() | {"dynamics": arguments.dynamics, "set": arguments.set}
+    jobs = []
+    for name in arguments.tasks or TASKS:
+        values: dict[str, Any] = {"total_steps": TASKS[name].total_steps}
+        for each in arguments.set:
+            apply_override(values, each)
+        config = GailConfig.model_validate(values)
+        jobs += [(name, arguments.dynamics, seed, config, arguments.keep) for seed in arguments.seeds]
+    results = []
+    with ProcessPoolExecutor(arguments.processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for future in [pool.submit(run_seed, *job) for job in jobs]:
+            results.append(future.result())
+            print({name: value for name, value in results[-1].items() if name != "curve"}, flush=True)
+            save(arguments.json, found | {"seeds": results})
+    for name in arguments.tasks or TASKS:
+        seen = [result for result in results if result["task"] == name]
+        reached = [result["steps_to_target"] or float("inf") for result in seen]
+        print(
+            f"{name}: median steps to {TASKS[name].target:,.0f}: {median(reached):,.0f}; final return mean "
+            f"{np.mean([result['final_return'] for result in seen]):,.0f}, worst "
+            f"{min(result['final_return'] for result in seen):,.0f}; starts solved, worst seed "
+            f"{min(result['final_share'] for result in seen):.0%}"
+        )
 
 
 if __name__ == "__main__":

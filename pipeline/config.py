@@ -6,7 +6,7 @@ Every field has a type, a default where one is sensible, and a line below it. No
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, model_validator
 
 UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
 Hidden = Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
@@ -34,7 +34,7 @@ class TrpoConfig(_Section):
     damping: PositiveFloat = 0.1
     """Multiple of the identity added to the Fisher matrix."""
     fisher_every: PositiveInt = 4
-    """Every n-th state of a batch enters the Fisher-vector products; 1 is the official code's."""
+    """One state in n, drawn from the batch, enters the Fisher-vector products; 1 is the official code's."""
     cg_iterations: PositiveInt = 10
     """Conjugate gradient iterations per step."""
     cg_tolerance: PositiveFloat = 1e-10
@@ -83,10 +83,13 @@ class DiscriminatorConfig(_Section):
     """Widths of the hidden layers."""
     learning_rate: PositiveFloat = 1e-3
     """Adam's step size."""
-    steps_per_iteration: PositiveInt = 1
-    """Full-batch steps after each policy update."""
-    ignored: tuple[NonNegativeInt, ...] = ()
-    """State dimensions that it does not see: where a robot has got to, for one that cannot fall."""
+    steps_per_iteration: PositiveInt = 3
+    """Steps after each policy update; each takes its share of the iteration's batch."""
+    view: Literal["change", "raw"] = "change"
+    """What it sees of a pair: (s, s' - s), each dimension standardized over the demonstrations; or (s, s') as they
+    are, the paper's."""
+    gradient_penalty: float = Field(default=1.0, ge=0.0)
+    """Weight of half the squared gradient of its logit at demonstrations."""
     reward: Literal["positive", "logit"] = "positive"
     """-log(1 - D), which also pays for going on; or log D - log(1 - D), which is negative away from the demonstrations
     and may pay for ending."""
@@ -113,13 +116,15 @@ class TrainingConfig(_Section):
     """Widths of the policy's hidden layers."""
     normalize_observations: bool = True
     """Standardize what policy and value see, by the weighted demonstrations' statistics (for experts, by running
-    ones). The discriminator always sees raw states."""
+    ones)."""
     scale_rewards: bool = False
     """Multiply rewards by 1 - discount, so that values are of order one."""
     anneal: bool = True
     """Let the steps of the policy and of the discriminator shrink linearly to zero, so that the end is settled."""
     initial_log_std: float = 0.0
     """Logarithm of the policy's initial standard deviation."""
+    final_std: PositiveFloat | None = None
+    """What the policy's standard deviation shrinks to in the second half of the training; null leaves it alone."""
     policy_optimizer: Annotated[TrpoConfig | PpoConfig, Field(discriminator="kind")] = TrpoConfig()
     """How the policy is improved."""
     value: ValueConfig = ValueConfig()

@@ -57,7 +57,7 @@ def load_config(
         path = find_config(source)
         values, origin, base = _read_yaml(path), str(path), path.resolve().parent
     for override in overrides or ():
-        _override(values, override)
+        apply_override(values, override)
     return _resolve_paths(parse_config(values, origin), base)
 
 
@@ -88,7 +88,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return values
 
 
-def _override(values: dict[str, Any], override: str) -> None:
+def apply_override(values: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     if not equals or not key:
         raise ConfigError(f"override {override!r} is not of the form key=value")

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 
+LARGEST_INPUT = 10.0
+"""Where standardized inputs of networks are clipped, see `GaussianPolicy.input_limit`."""
+
 
 class Controller(Protocol):
     """Whatever acts: a policy, or a controller that somebody wrote."""
@@ -33,12 +36,17 @@ class GaussianPolicy:
     """(S,) subtracted from the observation."""
     input_scale: Array
     """(S,) multiplied afterwards."""
+    input_limit: float = float("inf")
+    """Standardized inputs are clipped here. A dimension that hardly moves in the demonstrations, such as the height
+    of a box, moves by a hundred of its deviations once something falls, and would saturate the network."""
 
     def mean(self, observations: NDArray[np.float64]) -> Array:
         """Return (G, A) mean actions, which are also the deterministic ones, for (G, S) observations."""
         # In place and by `dot`, which for matrices this small saves a fifth of the time.
         hidden = observations.astype(np.float32) - self.input_mean
         hidden *= self.input_scale
+        if self.input_limit < np.inf:
+            np.clip(hidden, -self.input_limit, self.input_limit, out=hidden)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = hidden.dot(weight)
             hidden += bias
@@ -55,6 +63,7 @@ class GaussianPolicy:
     def arrays(self) -> dict[str, Array]:
         """Return the parameters by name, for messages and files; `from_arrays` is the inverse."""
         named = {"log_std": self.log_std, "input_mean": self.input_mean, "input_scale": self.input_scale}
+        named["input_limit"] = np.array(self.input_limit, np.float32)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             named[f"weight_{i}"], named[f"bias_{i}"] = weight, bias
         return named
@@ -66,7 +75,8 @@ class GaussianPolicy:
         try:
             weights = tuple(arrays[f"weight_{i}"] for i in range(depth))
             biases = tuple(arrays[f"bias_{i}"] for i in range(depth))
-            policy = cls(weights, biases, arrays["log_std"], arrays["input_mean"], arrays["input_scale"])
+            limit = float(arrays.get("input_limit", np.inf))  # Experts that were saved without one have none.
+            policy = cls(weights, biases, arrays["log_std"], arrays["input_mean"], arrays["input_scale"], limit)
         except KeyError as error:
             raise ValueError(f"policy has no array {error.args[0]!r}") from None
         widths = [len(policy.input_mean), *(len(bias) for bias in biases)]

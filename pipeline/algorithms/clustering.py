@@ -19,8 +19,9 @@ from sklearn.cluster import KMeans
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from oodil.pipeline.algorithms.contrastive import Encoder, Sampling, Subtrajectories, contrastive_loss, standardization
+from oodil.pipeline.algorithms.contrastive import Encoder, Sampling, Subtrajectories, contrastive_loss
 from oodil.pipeline.algorithms.optimizer import Adam
+from oodil.pipeline.algorithms.standardization import standardization
 from oodil.pipeline.artifacts import below, nested
 from oodil.pipeline.config import ClusteringConfig
 from oodil.pipeline.data import Demonstrations

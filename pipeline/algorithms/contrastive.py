@@ -90,14 +90,6 @@ class Subtrajectories:
         return self._states[torch.from_numpy(self.sampling.draw(self._starts[chosen], self._lengths[chosen], rng))]
 
 
-def standardization(observations: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the (S,) mean of (M, S) states and the reciprocal of their deviation, 1 where a dimension is constant."""
-    mean = observations.mean(axis=0, dtype=np.float64)
-    deviation = observations.std(axis=0, dtype=np.float64)
-    constant = deviation <= 1e-6 * np.maximum(1.0, np.abs(mean))
-    return mean.astype(np.float32), np.where(constant, 1.0, 1 / np.where(constant, 1.0, deviation)).astype(np.float32)
-
-
 class Encoder(nn.Module):
     """F: a one-layer LSTM whose last hidden output, scaled to length 1, is the feature of a sub-trajectory."""
 

@@ -16,8 +16,12 @@ from torch.nn.functional import softplus
 
 from oodil.pipeline.algorithms.networks import MLP
 from oodil.pipeline.algorithms.optimizer import Adam
+from oodil.pipeline.algorithms.standardization import standardization
 from oodil.pipeline.config import DiscriminatorConfig
 from oodil.pipeline.data import Demonstrations, offsets_of
+from oodil.pipeline.policy import LARGEST_INPUT
+
+Array = NDArray[np.float64]
 
 
 def discriminator_losses(demonstration_logits: Tensor, policy_logits: Tensor) -> tuple[Tensor, Tensor]:
@@ -35,45 +39,76 @@ def imitation_reward(logits_expert_is_high: Tensor, kind: Literal["positive", "l
 
 
 class Discriminator(nn.Module):
-    """A network on pairs (s, s') and its optimizer."""
+    """A network on the view of pairs (s, s') and its optimizer."""
 
-    def __init__(self, observation_dim: int, config: DiscriminatorConfig, rng: torch.Generator) -> None:
+    input_mean: Tensor
+    input_scale: Tensor
+
+    def __init__(self, demonstrations: Demonstrations, weights: Array, config: DiscriminatorConfig, seed: int) -> None:
+        """Draw a network for demonstrations that count as much as their (N,) weights say."""
         super().__init__()
         self.config = config
-        self._seen = np.setdiff1d(np.arange(observation_dim), config.ignored)
-        self.net = MLP(2 * len(self._seen), config.hidden, 1, rng)
+        dim = 2 * demonstrations.observation_dim
+        self.net = MLP(dim, config.hidden, 1, torch.Generator().manual_seed(seed))
+        mean, scale = np.zeros(dim, np.float32), np.ones(dim, np.float32)
+        if config.view == "change":
+            starts = demonstrations.transition_starts()
+            states, successors = demonstrations.observations[starts], demonstrations.observations[starts + 1]
+            each = np.repeat(weights, demonstrations.lengths - 1)
+            mean, scale = standardization(np.concatenate((states, successors - states), axis=1), each)
+        self.register_buffer("input_mean", torch.from_numpy(mean))
+        self.register_buffer("input_scale", torch.from_numpy(scale))
         self.restart_optimizer()
 
     def restart_optimizer(self) -> None:
         """Reset the optimizer's moments and learning rate."""
         self.optimizer = Adam(list(self.parameters()), self.config.learning_rate)
 
-    def forward(self, pairs: Tensor) -> Tensor:
-        """Return (B,) logits of `pairs`; high for demonstrations."""
-        return self.net(pairs).squeeze(-1)
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Return (B,) logits of inputs from `inputs`; high for demonstrations."""
+        return self.net(inputs).squeeze(-1)
 
-    def pairs(self, states: NDArray[np.float32], successors: NDArray[np.float32]) -> Tensor:
-        """Return (B, 2S) inputs from (B, S) states and their successors, without the ignored dimensions."""
-        if self.config.ignored:
-            states, successors = states[:, self._seen], successors[:, self._seen]
-        return torch.from_numpy(np.concatenate((states, successors), axis=1))
+    def inputs(self, states: NDArray[np.float32], successors: NDArray[np.float32]) -> Tensor:
+        """Return (B, 2S) inputs for (B, S) states and their successors.
 
-    def update(self, demonstration_pairs: Tensor, policy_pairs: Tensor) -> dict[str, float]:
-        """Take one full-batch step on (M, 2S) demonstration pairs against (B, 2S) policy pairs.
-
-        Returns metrics of the discriminator as it was before: its loss, and loss and accuracy on either side.
+        The ``change`` view is (s, s' - s), each dimension standardized over the demonstrations: beside s, the change
+        within one step is too small to be seen in s', and the dynamics are in nothing else.
         """
-        count = len(demonstration_pairs)
-        logits = self(torch.cat((demonstration_pairs, policy_pairs)))
-        demonstration_loss, policy_loss = discriminator_losses(logits[:count], logits[count:])
+        if self.config.view == "raw":
+            return torch.from_numpy(np.concatenate((states, successors), axis=1))
+        pairs = np.concatenate((states, successors - states), axis=1)
+        pairs -= self.input_mean.numpy()
+        pairs *= self.input_scale.numpy()
+        return torch.from_numpy(np.clip(pairs, -LARGEST_INPUT, LARGEST_INPUT, out=pairs))
+
+    def update(self, demonstration_inputs: Tensor, policy_inputs: Tensor) -> dict[str, float]:
+        """Take one step on (M, 2S) inputs of demonstrations against (B, 2S) of the policy.
+
+        The squared gradient of the logit at demonstrations is penalized (R1, Mescheder et al. 2018,
+        https://arxiv.org/abs/1801.04406): the discriminator cannot become so steep that it tells from each other what
+        is nearly the same, and where policy and demonstrations are the same, D = 1/2 costs nothing.
+
+        Returns metrics of the discriminator as it was before: its loss, loss and accuracy on either side, and the mean
+        squared gradient.
+        """
+        penalty = self.config.gradient_penalty
+        demonstration_inputs = demonstration_inputs.detach().requires_grad_(penalty > 0)
+        demonstration_logits, policy_logits = self(demonstration_inputs), self(policy_inputs)
+        demonstration_loss, policy_loss = discriminator_losses(demonstration_logits, policy_logits)
         loss = demonstration_loss + policy_loss
+        squared_gradient = torch.zeros(())
+        if penalty > 0:
+            (gradient,) = torch.autograd.grad(demonstration_logits.sum(), demonstration_inputs, create_graph=True)
+            squared_gradient = gradient.square().sum(1).mean()
+            loss = loss + 0.5 * penalty * squared_gradient
         self.optimizer.step(loss)
         return {
-            "discriminator_loss": float(loss.detach()),
+            "discriminator_loss": float((demonstration_loss + policy_loss).detach()),
             "discriminator_demonstration_loss": float(demonstration_loss.detach()),
             "discriminator_policy_loss": float(policy_loss.detach()),
-            "demonstration_accuracy": float((logits[:count] > 0).float().mean()),
-            "policy_accuracy": float((logits[count:] < 0).float().mean()),
+            "discriminator_squared_gradient": float(squared_gradient.detach()),
+            "demonstration_accuracy": float((demonstration_logits > 0).float().mean()),
+            "policy_accuracy": float((policy_logits < 0).float().mean()),
         }
 
 
@@ -82,6 +117,6 @@ def mean_logit_per_demonstration(discriminator: Discriminator, demonstrations: D
     """Return (N,) logits averaged over each demonstration, for Eqn (6)."""
     starts = demonstrations.transition_starts()
     states = demonstrations.observations
-    logits = discriminator(discriminator.pairs(states[starts], states[starts + 1])).double().numpy()
+    logits = discriminator(discriminator.inputs(states[starts], states[starts + 1])).double().numpy()
     counts = demonstrations.lengths - 1
     return np.asarray(np.add.reduceat(logits, offsets_of(counts)[:-1]) / counts)

@@ -17,6 +17,7 @@ from oodil.pipeline.algorithms.discriminator import (
     mean_logit_per_demonstration,
 )
 from oodil.pipeline.algorithms.learner import Learner
+from oodil.pipeline.algorithms.standardization import standardization
 from oodil.pipeline.artifacts import below, nested
 from oodil.pipeline.config import DiscriminatorConfig, GailConfig
 from oodil.pipeline.data import Demonstrations, TransitionBatch
@@ -47,34 +48,30 @@ class AdversarialReward:
         self._cumulative = np.cumsum(np.repeat(weights, demonstrations.lengths - 1))
         self._state_weights = np.repeat(weights, demonstrations.lengths)
         self._observations = demonstrations.observations
-        rng = torch.Generator().manual_seed(torch_seed(derive_key(root_seed, "discriminator", "initial")))
-        self.discriminator = Discriminator(demonstrations.observation_dim, config, rng)
-        self._paired: tuple[TransitionBatch, Tensor] | None = None
+        seed = torch_seed(derive_key(root_seed, "discriminator", "initial"))
+        self.discriminator = Discriminator(demonstrations, weights, config, seed)
+        self._policy_inputs: tuple[TransitionBatch, Tensor] | None = None
 
-    def state_moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the (S,) mean and standard deviation of the demonstrations' states under their weights."""
-        states = self._observations.astype(np.float64)
-        mean = np.average(states, axis=0, weights=self._state_weights)
-        variance = np.average(np.square(states - mean), axis=0, weights=self._state_weights)
-        return np.asarray(mean), np.sqrt(variance)
+    def state_standardization(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return (S,) mean and scale of the demonstrations' states under their weights."""
+        return standardization(self._observations, self._state_weights)
 
     @torch.no_grad()
     def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
         """Return (T, G) rewards; `Learner` asks for them before the discriminator's step of the same iteration."""
-        logits = self.discriminator(self._policy_pairs(batch))
+        logits = self.discriminator(self._inputs_of(batch))
         rewards = imitation_reward(logits, self.discriminator.config.reward).numpy()
         return rewards.reshape(batch.terminated.shape)
 
     def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
-        """Train the discriminator on the batch and as many demonstration pairs, but no more than there are."""
+        """Train the discriminator on the batch, a part of it at each step, and on as many demonstration pairs."""
         config = self.discriminator.config
         self.discriminator.optimizer.learning_rate = config.learning_rate * step_scale
-        policy_pairs = self._policy_pairs(batch)
+        policy_inputs = self._inputs_of(batch)
         rng = numpy_rng(derive_key(self.root_seed, "discriminator", iteration))
-        count = min(len(self._starts), len(policy_pairs))
         metrics: dict[str, float] = {}
-        for _ in range(config.steps_per_iteration):
-            metrics = self.discriminator.update(self.draw(count, rng), policy_pairs)
+        for chosen in np.array_split(rng.permutation(len(policy_inputs)), config.steps_per_iteration):
+            metrics = self.discriminator.update(self.draw(len(chosen), rng), policy_inputs[torch.from_numpy(chosen)])
         return metrics
 
     def settle(self, batch: TransitionBatch, steps: int, batch_size: int) -> None:
@@ -85,18 +82,18 @@ class AdversarialReward:
         belong to a policy that was changing, and its learning rate had been annealed.
         """
         self.discriminator.restart_optimizer()
-        policy_pairs = self._policy_pairs(batch)
+        policy_inputs = self._inputs_of(batch)
         rng = numpy_rng(derive_key(self.root_seed, "discriminator", "settle"))
         for _ in range(steps):
-            chosen = torch.from_numpy(rng.integers(len(policy_pairs), size=batch_size))
-            self.discriminator.update(self.draw(batch_size, rng), policy_pairs[chosen])
+            chosen = torch.from_numpy(rng.integers(len(policy_inputs), size=batch_size))
+            self.discriminator.update(self.draw(batch_size, rng), policy_inputs[chosen])
 
     def draw(self, count: int, rng: np.random.Generator) -> Tensor:
         """Draw ``count`` demonstration pairs with replacement, in proportion to the weights."""
         points = rng.random(count) * self._cumulative[-1]
         chosen = np.searchsorted(self._cumulative, points, side="right")
         starts = self._starts[np.minimum(chosen, len(self._starts) - 1)]
-        return self.discriminator.pairs(self._observations[starts], self._observations[starts + 1])
+        return self.discriminator.inputs(self._observations[starts], self._observations[starts + 1])
 
     def discriminator_arrays(self) -> dict[str, NDArray[np.float32]]:
         """Return the discriminator's parameters by name; `load_discriminator` is the inverse."""
@@ -120,13 +117,13 @@ class AdversarialReward:
         self.discriminator.load_state_dict(below("net", state))
         self.discriminator.optimizer.load_state_dict(below("optimizer", state))
 
-    def _policy_pairs(self, batch: TransitionBatch) -> Tensor:
+    def _inputs_of(self, batch: TransitionBatch) -> Tensor:
         """Return (B, 2S) inputs of the discriminator; those of the last batch are kept, as an iteration asks twice."""
-        if self._paired is None or self._paired[0] is not batch:
+        if self._policy_inputs is None or self._policy_inputs[0] is not batch:
             shape = len(batch), -1
-            pairs = self.discriminator.pairs(batch.observations.reshape(shape), batch.next_observations.reshape(shape))
-            self._paired = batch, pairs
-        return self._paired[1]
+            states, successors = batch.observations.reshape(shape), batch.next_observations.reshape(shape)
+            self._policy_inputs = batch, self.discriminator.inputs(states, successors)
+        return self._policy_inputs[1]
 
 
 def imitator(

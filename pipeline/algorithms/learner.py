@@ -16,6 +16,7 @@ from torch import Tensor
 from oodil.pipeline.algorithms.advantages import generalized_advantages, standardized
 from oodil.pipeline.algorithms.networks import PolicyNetwork
 from oodil.pipeline.algorithms.policy_optimizer import policy_optimizer
+from oodil.pipeline.algorithms.standardization import mean_and_scale
 from oodil.pipeline.algorithms.value import ValueFunction
 from oodil.pipeline.artifacts import below, nested
 from oodil.pipeline.config import TrainingConfig
@@ -23,15 +24,12 @@ from oodil.pipeline.data import TransitionBatch
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.seeding import derive_key, torch_seed
 
-SMALLEST_DEVIATION = 1e-4
-"""Smallest standard deviation by which an input is divided; a smaller one would magnify noise."""
-
 
 class RewardModel(Protocol):
     """Where an iteration's rewards come from."""
 
-    def state_moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return (S,) mean and standard deviation to normalize states by; None lets the learner estimate them."""
+    def state_standardization(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Return (S,) mean and scale to normalize states by; None lets the learner estimate them."""
 
     def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
         """Return (T, G) rewards."""
@@ -49,7 +47,7 @@ class RewardModel(Protocol):
 class EnvReward:
     """The environment's own reward, for training experts only."""
 
-    def state_moments(self) -> None:
+    def state_standardization(self) -> None:
         """Return None: the states are not known before training."""
         return None
 
@@ -88,10 +86,10 @@ class Learner(Generic[Reward]):
             self.policy.log_std.fill_(config.initial_log_std)
         self.value = ValueFunction(observation_dim, config.value, rng)
         self.policy_optimizer = policy_optimizer(self.policy, config.policy_optimizer)
-        moments = reward_model.state_moments()
-        self._tracks_moments = config.normalize_observations and moments is None
-        if config.normalize_observations and moments is not None:
-            self._normalize_by(*(torch.from_numpy(moment) for moment in moments))
+        known = reward_model.state_standardization()
+        self._tracks_moments = config.normalize_observations and known is None
+        if config.normalize_observations and known is not None:
+            self.policy.standardize_by(*known)
         self._moments = torch.zeros(1 + 2 * observation_dim, dtype=torch.float64)
 
     def behavior_policy(self) -> GaussianPolicy:
@@ -133,9 +131,22 @@ class Learner(Generic[Reward]):
             rng,
             step_scale,
         )
+        self._shrink_noise(iteration)
         metrics |= self.value.fit(inputs, torch.from_numpy(advantages + values).flatten(), rng)
         metrics |= self.reward_model.update(batch, iteration, step_scale)
         return metrics
+
+    @torch.no_grad()
+    def _shrink_noise(self, iteration: int) -> None:
+        """Lower the ceiling of the policy's deviation, from its first value to its last, in the second half.
+
+        The last value is its floor throughout: a policy that has lost its noise early explores no more.
+        """
+        config = self.config
+        if config.final_std is not None:
+            done = max(0.0, 2 * (iteration + 1) / config.num_iterations - 1)
+            floor = float(np.log(config.final_std))
+            self.policy.log_std.clamp_(floor, (1 - done) * config.initial_log_std + done * floor)
 
     @torch.no_grad()
     def _values(self, inputs: Tensor, batch: TransitionBatch) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -155,14 +166,11 @@ class Learner(Generic[Reward]):
         """Set the input normalizer to the mean and standard deviation of all observations so far."""
         wide = observations.double()
         self._moments += torch.cat((torch.tensor([float(len(wide))]), wide.sum(0), wide.square().sum(0)))
-        count, (total, squares) = self._moments[0], self._moments[1:].view(2, -1)
-        mean = total / count
-        self._normalize_by(mean, (squares / count - mean.square()).clamp_min(0).sqrt())
-
-    def _normalize_by(self, mean: Tensor, deviation: Tensor) -> None:
-        """Set the input normalizer to (S,) mean and standard deviation."""
-        self.policy.input_mean.copy_(mean)
-        self.policy.input_scale.copy_(1 / deviation.clamp_min(SMALLEST_DEVIATION))
+        count, (total, squares) = self._moments[0], self._moments[1:].view(2, -1).numpy()
+        mean = total / float(count)
+        self.policy.standardize_by(
+            *mean_and_scale(mean, np.sqrt(np.maximum(0, squares / float(count) - np.square(mean))))
+        )
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return everything that later iterations depend on, as named tensors."""

@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.policy import LARGEST_INPUT, GaussianPolicy
 
 
 class Tanh(torch.autograd.Function):
@@ -114,6 +115,7 @@ class PolicyNetwork(nn.Module):
 
     input_mean: Tensor
     input_scale: Tensor
+    input_limit: Tensor
 
     def __init__(self, observation_dim: int, action_dim: int, hidden: tuple[int, ...], rng: torch.Generator) -> None:
         super().__init__()
@@ -121,10 +123,18 @@ class PolicyNetwork(nn.Module):
         self.log_std = nn.Parameter(torch.zeros(action_dim))
         self.register_buffer("input_mean", torch.zeros(observation_dim))
         self.register_buffer("input_scale", torch.ones(observation_dim))
+        self.register_buffer("input_limit", torch.tensor(torch.inf))
+
+    def standardize_by(self, mean: NDArray[np.float32], scale: NDArray[np.float32]) -> None:
+        """Subtract a (S,) mean from observations, multiply them by a (S,) scale, and clip them."""
+        self.input_mean.copy_(torch.from_numpy(mean))
+        self.input_scale.copy_(torch.from_numpy(scale))
+        self.input_limit.fill_(LARGEST_INPUT)
 
     def normalize(self, observations: Tensor) -> Tensor:
         """Return (B, S) observations as the network sees them."""
-        return (observations - self.input_mean) * self.input_scale
+        inputs = (observations - self.input_mean) * self.input_scale
+        return inputs.clamp_(-self.input_limit, self.input_limit)
 
     def forward(self, observations: Tensor) -> Tensor:
         """Return (B, A) mean actions."""
@@ -150,4 +160,5 @@ class PolicyNetwork(nn.Module):
             log_std=self.log_std.detach().numpy().copy(),
             input_mean=self.input_mean.numpy().copy(),
             input_scale=self.input_scale.numpy().copy(),
+            input_limit=float(self.input_limit),
         )

@@ -62,7 +62,7 @@ class Trpo:
         rng: torch.Generator,
         step_scale: float,
     ) -> dict[str, float]:
-        """Improve the policy on one batch, see `PolicyOptimizer`; nothing is drawn with ``rng``.
+        """Improve the policy on one batch, see `PolicyOptimizer`.
 
         ``step_scale`` multiplies the trust region, and so its root the step.
 
@@ -75,8 +75,10 @@ class Trpo:
         surrogate = (torch.exp(policy.log_prob(mean, actions) - log_probs) * advantages).mean()
         gradient = _flatten(torch.autograd.grad(surrogate, self._parameters))
         old_mean, old_log_std = mean.detach(), policy.log_std.detach().clone()
-        # The curvature may be less exact than the gradient, and products with it are the expensive part of a step.
-        linearization = Linearization(policy.net, inputs[:: config.fisher_every].contiguous())
+        # The curvature may be less exact than the gradient, and products with it are the expensive part of a step. Its
+        # states are drawn: rows are in the order of the simulators, and every n-th would be always of the same ones.
+        chosen = torch.randperm(len(inputs), generator=rng)[: -(-len(inputs) // config.fisher_every)]
+        linearization = Linearization(policy.net, inputs[chosen] if config.fisher_every > 1 else inputs)
         precision = torch.exp(-2 * old_log_std) / len(linearization.output)
 
         def fisher_product(vector: Tensor) -> Tensor:

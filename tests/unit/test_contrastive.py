@@ -8,7 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from oodil.pipeline.algorithms.contrastive import Encoder, Sampling, Subtrajectories, contrastive_loss, standardization
+from oodil.pipeline.algorithms.contrastive import Encoder, Sampling, Subtrajectories, contrastive_loss
+from oodil.pipeline.algorithms.standardization import standardization
 from oodil.pipeline.config import ClusteringConfig
 from oodil.pipeline.data import Demonstrations
 

@@ -16,6 +16,7 @@ from oodil.pipeline.errors import DataError
 
 
 def build(demonstrations, weights, **settings):
+    settings = {"view": "raw"} | settings  # so that a drawn pair says where it comes from
     return AdversarialReward(
         demonstrations, np.array(weights, np.float64), DiscriminatorConfig(**settings), root_seed=0
     )
@@ -91,18 +92,18 @@ def test_rewards_belong_to_the_steps_that_earned_them(demonstrations, rollout):
             assert result[t, g] == pytest.approx(float(imitation_reward(logit, "positive")[0]), rel=1e-5)
 
 
-def test_pairs_are_built_once_for_a_batch(demonstrations, rollout, monkeypatch):
+def test_inputs_are_built_once_for_a_batch(demonstrations, rollout, monkeypatch):
     reward = build(demonstrations(20), [1.0])
     batches = [batch_of(rollout(seed)) for seed in range(2)]
     built = []
-    pairs = reward.discriminator.pairs
+    inputs = reward.discriminator.inputs
 
     def count(states, successors):
         built.append(len(states))
-        return pairs(states, successors)
+        return inputs(states, successors)
 
-    monkeypatch.setattr(reward.discriminator, "pairs", count)
-    monkeypatch.setattr(reward, "draw", lambda count, rng: pairs(*2 * [np.ones((count, 3), np.float32)]))
+    monkeypatch.setattr(reward.discriminator, "inputs", count)
+    monkeypatch.setattr(reward, "draw", lambda count, rng: inputs(*2 * [np.ones((count, 3), np.float32)]))
     for iteration, batch in enumerate(batches):
         reward.rewards(batch)
         reward.update(batch, iteration, 1.0)
@@ -127,16 +128,19 @@ def test_update_raises_the_reward_of_demonstrations(demonstrations, rollout):
     assert margin() > before + 0.1
 
 
-@pytest.mark.parametrize(("num_states", "num_steps", "expected"), [(40, 4, 12), (10, 50, 9)])
-def test_as_many_demonstration_pairs_as_policy_pairs_or_all(
-    demonstrations, rollout, monkeypatch, num_states, num_steps, expected
+@pytest.mark.parametrize("num_states", [5, 200])
+def test_each_step_sees_its_share_of_the_batch_and_as_many_demonstration_pairs(
+    demonstrations, rollout, monkeypatch, num_states
 ):
-    reward = build(demonstrations(num_states), [1.0])
-    counts = []
-    monkeypatch.setattr(reward.discriminator, "update", lambda shown, policy: counts.append((len(shown), len(policy))))
-    reward.update(batch_of(rollout(0, num_steps=num_steps)), 0, 1.0)
-    # 4 steps of 3 simulators against 39 transitions: 12 of each; 50 steps against 9 transitions: 9 draws.
-    assert counts == [(expected, 3 * num_steps)]
+    reward = build(demonstrations(num_states), [1.0], steps_per_iteration=4)
+    seen = []
+    monkeypatch.setattr(reward.discriminator, "update", lambda shown, policy: seen.append((shown, policy)))
+    batch = batch_of(rollout(0, num_steps=10))  # 30 transitions
+    reward.update(batch, 0, 1.0)
+    assert [(len(shown), len(policy)) for shown, policy in seen] == [(8, 8), (8, 8), (7, 7), (7, 7)]
+    together = torch.cat([policy for _, policy in seen]).numpy()
+    everything = np.concatenate([batch.observations, batch.next_observations], axis=-1).reshape(30, -1)
+    np.testing.assert_array_equal(np.sort(together, axis=0), np.sort(everything, axis=0))
 
 
 def test_an_update_depends_on_the_iteration_and_not_on_what_was_drawn_before(demonstrations, rollout, assert_same_bits):
@@ -161,7 +165,7 @@ def test_an_artificial_reward_of_the_environment_changes_nothing(demonstrations,
 def test_state_restores_another_instance(demonstrations, rollout, assert_same_bits):
     one = build(demonstrations(20), [1.0])
     one.update(batch_of(rollout(0)), 0, 1.0)
-    two = AdversarialReward(demonstrations(20), np.ones(1), DiscriminatorConfig(), root_seed=0)
+    two = build(demonstrations(20), [1.0])
     two.load_state_dict({name: value.clone() for name, value in one.state_dict().items()})
     for iteration in (1, 2):
         one.update(batch_of(rollout(iteration)), iteration, 1.0)
@@ -182,7 +186,7 @@ def test_step_scale_multiplies_the_step_size(demonstrations, rollout):
     """Adam's first step moves each parameter by about its step size, whatever the gradient."""
 
     def moved(step_scale):
-        reward = build(demonstrations(20), [1.0], learning_rate=1e-2)
+        reward = build(demonstrations(20), [1.0], learning_rate=1e-2, steps_per_iteration=1)
         before = [p.detach().clone() for p in reward.discriminator.parameters()]
         reward.update(batch_of(rollout(0)), 0, step_scale)
         after = reward.discriminator.parameters()

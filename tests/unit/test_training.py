@@ -54,6 +54,7 @@ DISCRIMINATOR = {
     "discriminator_loss",
     "discriminator_demonstration_loss",
     "discriminator_policy_loss",
+    "discriminator_squared_gradient",
     "demonstration_accuracy",
     "policy_accuracy",
 }

@@ -18,7 +18,7 @@ from oodil.pipeline.config import DiscriminatorConfig
 
 def test_mean_logit_is_over_the_transitions_of_each_demonstration(demonstrations):
     made = demonstrations(4, 2, 3)
-    discriminator = Discriminator(3, DiscriminatorConfig(hidden=(8,)), torch.Generator().manual_seed(0))
+    discriminator = Discriminator(made, np.ones(3), DiscriminatorConfig(hidden=(8,), view="raw"), seed=0)
     with torch.no_grad():
         for p in discriminator.parameters():
             p.copy_(torch.randn(p.shape, generator=torch.Generator().manual_seed(1)))
