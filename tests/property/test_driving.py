@@ -1,5 +1,7 @@
 """The driving world in its batched form against highway-env's own classes, over random worlds, drivers and episodes."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -84,6 +86,33 @@ def test_a_snapshot_continues_to_the_same_bits() -> None:
         assert one.env_rewards.tobytes() == two.env_rewards.tobytes()
     assert batch.snapshot().states.tobytes() == other.snapshot().states.tobytes()
     assert batch.episode_returns().tobytes() == other.episode_returns().tobytes()
+
+
+@pytest.mark.parametrize("steering", [0.3, -0.3])
+def test_the_heading_jumps_opposite_to_straight_ahead_alone(steering: float) -> None:
+    """A car that turns round once: its angle is that of its velocity, without a jump but at 3 pi / 2."""
+    batch = make_batch(ID, {}, 1)
+    batch.reset(0, 0)
+    start = batch.snapshot()
+    batch.restore(replace(start, states=np.array([[30.0, 12.0, np.pi / 2]])))
+    seen = [batch.observations()[0]]
+    while not len(seen) > 3 or abs(np.unwrap([row[4] for row in seen])[-1] - np.pi / 2) < 2 * np.pi:
+        batch.step(np.array([[steering]]))
+        seen.append(batch.observations()[0])
+    states = np.array(seen)
+    heading = states[:, 4]
+    assert (heading >= -np.pi / 2).all() and (heading < 1.5 * np.pi).all()
+    np.testing.assert_allclose(np.exp(1j * heading), states[:, 2] + 1j * states[:, 3], atol=1e-12)
+    (jump,) = np.flatnonzero(np.abs(np.diff(heading)) > 0.1)
+    np.testing.assert_allclose(states[jump : jump + 2, 3], -1, atol=0.01)  # it drives straight back
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_no_demonstrator_drives_near_the_jump(name: str) -> None:
+    cars = make_batch(ID, SOURCES[name], 60)
+    episodes = run_episodes(cars, hand_written(cars, ID), numpy_rng((1,)), stochastic=False)
+    headings = np.concatenate([episode.states[:, 4] for episode in episodes])
+    assert headings.min() > 0 and headings.max() < np.pi
 
 
 @pytest.mark.parametrize("name", SOURCES)
