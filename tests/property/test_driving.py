@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from oodil.pipeline.environments import make_batch
-from oodil.pipeline.environments.driving import GOAL, DrivingBatch, DrivingEnv, layout, touches
+from oodil.pipeline.environments.driving import GOAL, DrivingBatch, DrivingEnv, layout, observe, touches
 from oodil.pipeline.errors import OodilError
 from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.seeding import numpy_rng
@@ -105,6 +105,16 @@ def test_the_heading_jumps_opposite_to_straight_ahead_alone(steering: float) -> 
     np.testing.assert_allclose(np.exp(1j * heading), states[:, 2] + 1j * states[:, 3], atol=1e-12)
     (jump,) = np.flatnonzero(np.abs(np.diff(heading)) > 0.1)
     np.testing.assert_allclose(states[jump : jump + 2, 3], -1, atol=0.01)  # it drives straight back
+
+
+@given(st.floats(-50, 50))
+def test_an_observed_heading_is_its_own_observation(heading: float) -> None:
+    """A car put where it was seen is seen there again, to the bit."""
+    here = np.array([0.0])
+    seen = observe(here, here, np.array([heading]), 1.0)
+    again = observe(here, here, seen[:, 4], 1.0)[:, 4]
+    assert again.tobytes() == seen[:, 4].tobytes() or abs(again[0] - seen[0, 4]) == 2 * np.pi
+    np.testing.assert_allclose(np.exp(1j * seen[0, 4]), np.exp(1j * heading), atol=1e-13)
 
 
 @pytest.mark.parametrize("name", SOURCES)
