@@ -5,6 +5,7 @@ the higher sampled return is kept, because one that falls has a low one. A saved
 policy and what it reaches; only a better one replaces it.
 """
 
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ from oodil.pipeline.versions import library_versions
 TRAININGS = 2
 """Seeds tried per source."""
 EVALUATION_EPISODES = 64
+TRANSFER_EPISODES = 8
+"""Episodes of each source's expert under the imitator's own dynamics."""
 
 
 EXPERT_TRAINING = TrainingConfig(
@@ -158,6 +161,24 @@ def load_expert(path: Path) -> tuple[GaussianPolicy, Artifact]:
         return GaussianPolicy.from_arrays(artifact.arrays("policy.safetensors")), artifact
     except (DamagedArtifactError, ValueError) as error:
         raise ExpertError(str(error)) from error
+
+
+def transfer_returns(config: RunConfig) -> tuple[float, ...]:
+    """Return, by source, what its expert's mean actions return under the imitator's own dynamics; for reporting alone.
+
+    NaN for a hand-written controller, which is made for its own world, and for an expert with other actions.
+    """
+    target = config.environment
+    action_dim = environment_spec(target.id, target.dynamics).action_dim
+    key = derive_key(config.seed, "direct transfer")
+    returns = []
+    for source in config.demonstrations.sources:
+        policy = load_expert(source.expert_folder)[0] if source.expert_folder else None
+        if policy is None or len(policy.log_std) != action_dim:
+            returns.append(nan)
+        else:
+            returns.append(evaluate(policy, target.id, target.dynamics, TRANSFER_EPISODES, key).mean_return)
+    return tuple(returns)
 
 
 def _job(source: int, seed: int) -> str:

@@ -7,7 +7,7 @@ import pytest
 
 import oodil
 from oodil.pipeline.config import RunConfig
-from oodil.pipeline.stage import Run
+from oodil.pipeline.stage import Run, stage_named
 from oodil.pipeline.stages.experts import ExpertsStage
 from tests.runs import MICRO
 
@@ -98,6 +98,19 @@ def test_experts_alone_depend_on_how_they_are_trained() -> None:
     assert settings("demonstrations.sources.0.dynamics.gravity=9.9") != settings()
     for override in (MARKS, "demonstrations.sources.0.label=renamed", "demonstrations.sources.0.count=9"):
         assert settings(override) == settings(), override
+
+
+def test_the_dynamics_of_the_imitator_collect_nothing_again(run_dir: Path) -> None:
+    """What experts return in it is measured anew; the demonstrations of each source are kept."""
+    override = "environment.dynamics.gravity=13"
+    assert states(run_dir, override)["demonstrations"] == ("stale", "imitator.gravity 12.0 -> 13.0")
+    kept, changed = (
+        Run(oodil.load_config(MICRO, [BASELINES, *more]), oodil.open_run(run_dir).run.directory)
+        for more in ((), (override,))
+    )
+    stage = stage_named("demonstrations")
+    for job in stage.jobs(kept):
+        assert stage.job_origin(changed, job) == stage.job_origin(kept, job)
 
 
 def fields(section: type, prefix: str = "") -> Iterator[str]:
