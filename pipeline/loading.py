@@ -107,9 +107,8 @@ def apply_override(values: dict[str, Any], override: str) -> None:
 
 def _index(entries: list[Any], part: str, override: str) -> int:
     if not part.isdecimal() or int(part) >= len(entries):
-        raise ConfigError(
-            f"override {override!r}: {part} is not an entry of the list, which has 0 to {len(entries) - 1}"
-        )
+        there = f"has 0 to {len(entries) - 1}" if entries else "is empty"
+        raise ConfigError(f"override {override!r}: {part} is not an entry of the list, which {there}")
     return int(part)
 
 

@@ -35,12 +35,16 @@ class CollectedDemonstrations:
     kept_share: tuple[float, ...] = ()
     """By source, the share of collected episodes that were kept; empty for a file."""
     environment_id: str = ""
+    transfer_returns: tuple[float, ...] = ()
+    """By source, the mean true return of its expert's mean actions under the imitator's own dynamics; NaN for a
+    hand-written controller. For reporting alone; empty for a file."""
 
     def files(self) -> Files:
         """Return the artifact's content."""
+        sources = {"kept_share": list(self.kept_share), "transfer_returns": list(self.transfer_returns)}
         return {
             _DEMONSTRATIONS: encode_demonstrations(self.demonstrations, self.environment_id),
-            _SOURCES: encode_json({"kept_share": list(self.kept_share)}),
+            _SOURCES: encode_json(sources),
         }
 
     @classmethod
@@ -48,7 +52,9 @@ class CollectedDemonstrations:
         """Read an artifact."""
         path = str(artifact.path / _DEMONSTRATIONS)
         demonstrations, environment_id = decode_demonstrations(artifact.read(_DEMONSTRATIONS), path)
-        return cls(demonstrations, tuple(artifact.json(_SOURCES)["kept_share"]), environment_id)
+        sources = artifact.json(_SOURCES)
+        returns = tuple(np.nan if each is None else each for each in sources["transfer_returns"])
+        return cls(demonstrations, tuple(sources["kept_share"]), environment_id, returns)
 
 
 @dataclass(frozen=True)

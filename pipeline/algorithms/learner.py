@@ -115,8 +115,6 @@ class Learner(Generic[Reward]):
         # Scaled by 1 - discount, values are averages of rewards, and so of order one for every horizon.
         rewards = self.reward_model.rewards(batch) * np.float32(self._reward_scale)
         observations = torch.from_numpy(batch.observations).flatten(0, 1)
-        if self._tracks_moments:
-            self._track(observations)
         inputs = self.policy.normalize(observations)
         values, next_values = self._values(inputs, batch)
         advantages = generalized_advantages(
@@ -134,6 +132,9 @@ class Learner(Generic[Reward]):
         self._shrink_noise(iteration)
         metrics |= self.value.fit(inputs, torch.from_numpy(advantages + values).flatten(), rng)
         metrics |= self.reward_model.update(batch, iteration, step_scale)
+        if self._tracks_moments:
+            # Last, so that without lag the policy that is improved is the one that collected.
+            self._track(observations)
         return metrics
 
     @torch.no_grad()

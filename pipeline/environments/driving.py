@@ -87,18 +87,20 @@ def draw_start(rng: np.random.Generator) -> tuple[float, float, float]:
 
 
 def observe(x: Floats, y: Floats, heading: Floats, speed: float) -> Floats:
-    """Return (G, 5): position in [-1, 1], velocity in units of the imitator's speed, heading in [0, 2 pi).
+    """Return (G, 5): position in [-1, 1], velocity in units of the imitator's speed, heading in [-pi/2, 3 pi/2).
 
-    The steering is not in it, so states alone do not tell the actions.
+    The angle jumps opposite to straight ahead, where no demonstrator drives. The steering is not in it, so states alone
+    do not tell the actions.
     """
     units = speed / IMITATOR_SPEED
+    turns = np.floor(heading / (2 * np.pi) + 0.25)  # none for an angle that has been observed: it stays as it is
     return np.stack(
         (
             2 * (x / WIDTH - 0.5),
             2 * (y / HEIGHT - 0.5),
             units * np.cos(heading),
             units * np.sin(heading),
-            np.mod(heading, 2 * np.pi),
+            heading - 2 * np.pi * turns,
         ),
         axis=-1,
     )
@@ -131,7 +133,7 @@ class DrivingEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         self.render_mode = render_mode
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
         fast = speed / IMITATOR_SPEED
-        low, high = [-1.1, -1.1, -fast, -fast, 0.0], [1.1, 1.1, fast, fast, 2 * np.pi]
+        low, high = [-1.1, -1.1, -fast, -fast, -0.5 * np.pi], [1.1, 1.1, fast, fast, 1.5 * np.pi]
         self.observation_space = gymnasium.spaces.Box(np.array(low), np.array(high), dtype=np.float64)
         self._car: Any = None
 
@@ -279,9 +281,12 @@ class Driver:
 
     def mean(self, observations: Floats) -> NDArray[np.float32]:
         """Return (G, 1) steering angles for (G, 5) observations."""
-        return np.array([[self._steer(*row)] for row in observations[:, [0, 1, 4]]], np.float32)
+        east, north, heading = observations[:, [0, 1, 4]].T
+        seen = zip(east, north, np.mod(heading, 2 * np.pi), strict=True)
+        return np.array([[self._steer(*row)] for row in seen], np.float32)
 
     def _steer(self, east: float, north: float, heading: float) -> float:
+        """Return the steering angle for a heading in [0, 2 pi)."""
         x, y = (east / 2 + 0.5) * WIDTH, (north / 2 + 0.5) * HEIGHT
         if self._in_gap(x, heading):
             return float(np.clip(self._straighten(heading), -1, 1))

@@ -15,7 +15,7 @@ from oodil.pipeline.policy import Controller, GaussianPolicy
 from oodil.pipeline.results import CollectedDemonstrations
 from oodil.pipeline.seeding import derive_key, numpy_rng
 from oodil.pipeline.stage import JobContext, Run, Stage, register
-from oodil.pipeline.stages.experts import load_expert
+from oodil.pipeline.stages.experts import load_expert, transfer_returns
 
 COLLECTION_SIMULATORS = 16
 """Episodes collected side by side; part of what the demonstrations depend on."""
@@ -28,7 +28,7 @@ class DemonstrationsStage(Stage):
     """
 
     name = "demonstrations"
-    version = 2
+    version = 3
     inputs = ()
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
@@ -42,7 +42,11 @@ class DemonstrationsStage(Stage):
             for source in section.sources
         ]
         flags = section.model_dump(include={"deterministic", "full_length_only", "minimum_return"})
-        return common | flags | {"sources": sources}
+        return common | flags | {"sources": sources, "imitator": config.environment.dynamics}
+
+    def job_settings(self, config: RunConfig) -> dict[str, Any]:
+        """Return the settings without the imitator's dynamics, in which `combine` alone runs experts."""
+        return {name: value for name, value in self.settings(config).items() if name != "imitator"}
 
     def jobs(self, run: Run) -> list[str]:
         """Return one job per source, or the stage itself for a file."""
@@ -74,14 +78,14 @@ class DemonstrationsStage(Stage):
         return CollectedDemonstrations(demonstrations, (kept,), config.environment.id).files()
 
     def combine(self, run: Run) -> Files | None:
-        """Join the sources, in the order of the configuration."""
+        """Join the sources, in the order of the configuration, and see what their experts return elsewhere."""
         if not run.config.demonstrations.sources:
             return None
         parts = [CollectedDemonstrations.load(run.job_artifact(self.name, job)) for job in self.jobs(run)]
         joined = Demonstrations.joined([part.demonstrations for part in parts])
-        return CollectedDemonstrations(
-            joined, tuple(share for part in parts for share in part.kept_share), run.config.environment.id
-        ).files()
+        kept_share = tuple(share for part in parts for share in part.kept_share)
+        environment = run.config.environment.id
+        return CollectedDemonstrations(joined, kept_share, environment, transfer_returns(run.config)).files()
 
 
 def load_demonstrations(run: Run) -> Demonstrations:

@@ -2,9 +2,10 @@
 
 The stage is run by ``oodil demos collect --train`` alone. Each source gets two independent trainings, and the one with
 the higher sampled return is kept, because one that falls has a low one. A saved expert is an artifact folder with the
-policy and what it reaches.
+policy and what it reaches; only a better one replaces it.
 """
 
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +23,16 @@ from oodil.pipeline.environments import environment_spec
 from oodil.pipeline.errors import DamagedArtifactError, ExpertError
 from oodil.pipeline.evaluation import evaluate
 from oodil.pipeline.policy import GaussianPolicy
-from oodil.pipeline.seeding import derive_key
+from oodil.pipeline.results import Evaluation
+from oodil.pipeline.seeding import Key, derive_key
 from oodil.pipeline.stage import JobContext, Run, Stage, register
 from oodil.pipeline.versions import library_versions
 
 TRAININGS = 2
 """Seeds tried per source."""
 EVALUATION_EPISODES = 64
+TRANSFER_EPISODES = 8
+"""Episodes of each source's expert under the imitator's own dynamics."""
 
 
 EXPERT_TRAINING = TrainingConfig(
@@ -51,8 +55,17 @@ class ExpertsStage(Stage):
     """One job per source; `export` saves the experts where the configuration looks for them."""
 
     name = "experts"
-    version = 1
+    version = 2
     inputs = ()
+
+    def check(self, config: RunConfig) -> None:
+        """Raise ExpertError if a source's folder holds the expert of another environment."""
+        for source in config.demonstrations.sources:
+            if saved := _saved(source):
+                described = saved[1].json("expert.json").get("environment", {})
+                found = described.get("id", config.environment.id)
+                if found != config.environment.id:
+                    raise ExpertError(f"{source.expert}: holds an expert of {found}, not of {config.environment.id}")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return what the trainings depend on."""
@@ -99,18 +112,25 @@ class ExpertsStage(Stage):
         return {"chosen.json": encode_json(chosen)}
 
     def export(self, run: Run) -> list[str]:
-        """Save each source's expert in its folder; return a line about each."""
+        """Save each source's expert in its folder, unless the one there is as good; return a line about each."""
         chosen = run.artifact(self.name).json("chosen.json")
+        key = derive_key(run.config.seed, "expert comparison")
         lines = []
         for i, source in self._trained(run):
+            environment = EnvironmentConfig(id=run.config.environment.id, dynamics=source.dynamics)
             trained = run.job_artifact(self.name, chosen[str(i)])
+            policy = GaussianPolicy.from_arrays(trained.arrays("policy.safetensors"))
+            new = _run(policy, environment, key, stochastic=True)
+            saved = _saved(source)
+            old = _run(saved[0], environment, key, stochastic=True) if saved else None
+            line = f"{source.label}: {_said(new)} -> "
+            # Whatever is not better, NaN included, replaces nothing.
+            if old and not new.mean_return > old.mean_return:
+                lines.append(f"{line}not saved; kept the expert in {source.expert}: {_said(old)}")
+                continue
             files = {name: trained.read(name) for name in trained.hashes}
             write_artifact(Path(source.expert), {"expert": source.dynamics}, files, library_versions())
-            reached = trained.json("expert.json")["stochastic"]
-            lines.append(
-                f"{source.label}: return {reached['return_mean']:,.0f} ± {reached['return_std']:,.0f}, "
-                f"{reached['full_length_share']:.0%} of sampled episodes last -> {source.expert}"
-            )
+            lines.append(f"{line}{source.expert}" + (f", in place of one: {_said(old)}" if old else ""))
         return lines
 
 
@@ -143,27 +163,60 @@ def load_expert(path: Path) -> tuple[GaussianPolicy, Artifact]:
         raise ExpertError(str(error)) from error
 
 
+def transfer_returns(config: RunConfig) -> tuple[float, ...]:
+    """Return, by source, what its expert's mean actions return under the imitator's own dynamics; for reporting alone.
+
+    NaN for a hand-written controller, which is made for its own world, and for an expert with other actions.
+    """
+    target = config.environment
+    action_dim = environment_spec(target.id, target.dynamics).action_dim
+    key = derive_key(config.seed, "direct transfer")
+    returns = []
+    for source in config.demonstrations.sources:
+        policy = load_expert(source.expert_folder)[0] if source.expert_folder else None
+        if policy is None or len(policy.log_std) != action_dim:
+            returns.append(nan)
+        else:
+            returns.append(evaluate(policy, target.id, target.dynamics, TRANSFER_EPISODES, key).mean_return)
+    return tuple(returns)
+
+
 def _job(source: int, seed: int) -> str:
     return f"source-{source}-seed-{seed}"
+
+
+def _saved(source: SourceConfig) -> tuple[GaussianPolicy, Artifact] | None:
+    """Return the sound expert in a source's folder, or None; a damaged one is of no use to anybody."""
+    try:
+        return load_expert(source.expert_folder) if source.expert_folder else None
+    except ExpertError:
+        return None
+
+
+def _said(seen: Evaluation) -> str:
+    """Return what sampled episodes came to, in words."""
+    lasted = _full_length_share(seen)
+    return f"return {seen.mean_return:,.0f} ± {seen.std_return:,.0f}, {lasted:.0%} of sampled episodes last"
+
+
+def _full_length_share(seen: Evaluation) -> float:
+    return float((seen.lengths == seen.lengths.max()).mean())
+
+
+def _run(policy: GaussianPolicy, environment: EnvironmentConfig, key: Key, *, stochastic: bool) -> Evaluation:
+    return evaluate(policy, environment.id, environment.dynamics, EVALUATION_EPISODES, key, stochastic=stochastic)
 
 
 def _reached(policy: GaussianPolicy, environment: EnvironmentConfig, seed: int) -> dict[str, dict[str, float]]:
     reached = {}
     for name in ("deterministic", "stochastic"):
-        seen = evaluate(
-            policy,
-            environment.id,
-            environment.dynamics,
-            EVALUATION_EPISODES,
-            derive_key(seed, "expert evaluation"),
-            stochastic=name == "stochastic",
-        )
+        seen = _run(policy, environment, derive_key(seed, "expert evaluation"), stochastic=name == "stochastic")
         reached[name] = {
             "episodes": EVALUATION_EPISODES,
             "return_mean": seen.mean_return,
             "return_std": seen.std_return,
             "length_mean": seen.mean_length,
-            "full_length_share": float((seen.lengths == seen.lengths.max()).mean()),
+            "full_length_share": _full_length_share(seen),
         }
     return reached
 

@@ -267,7 +267,10 @@ def inspect_demos(path: Annotated[Path, typer.Argument(help="A file of demonstra
 def collect_demos(
     config_source: ConfigSource,
     overrides: Overrides = None,
-    train: Annotated[bool, typer.Option("--train", help="First train the experts anew, and save them.")] = False,
+    train: Annotated[
+        bool,
+        typer.Option("--train", help="First train the experts anew; a saved one is kept unless the new one is better."),
+    ] = False,
     output: Annotated[Path, typer.Option(help="The file to write.")] = Path("demonstrations.safetensors"),
     workers: Workers = None,
 ) -> None:
@@ -280,14 +283,16 @@ def collect_demos(
     from oodil.pipeline.stages.experts import ExpertsStage
 
     config = load_config(config_source, overrides)
-    if not train:
+    experts = ExpertsStage()
+    if train:
+        experts.check(config)
+    else:
         check_inputs(config)
     engine = _engine(config, "local", workers)
     first = choose(config, until="demonstrations")
     # What was collected for other settings is of no further use.
     opened = open_run(output.with_name(f".{output.name}.run"), config, [stage.name for stage in first])
     if train:
-        experts = ExpertsStage()
         _show_execution(opened, [experts], engine)
         print("\n".join(experts.export(opened)))
     _show_execution(opened, first, engine)

@@ -58,6 +58,8 @@ def config_for(tmp_path: Path):
         ("imitation.gail.policy_optimizer.max_kll=1", "did you mean 'max_kl'?"),
         ("seed=soon", "seed: Input should be a valid integer"),
         ("clustering.temperature=-1", "clustering.temperature: Input should be greater than 0, got -1"),
+        ("clustering.preset=[paper]", "clustering: preset is ['paper']; there are paper, official"),
+        ("demonstrations.sources.2.count=5", "2 is not an entry of the list, which has 0 to 1"),
         ("environment.id=oodil/Hoper-v0", "oodil/Hoper-v0"),
         ("environment={id: CartPole-v1}", "the action space is Discrete(2); only Box spaces can be used"),
         ("environment.dynamics.gravty=9", "gravty"),

@@ -7,7 +7,8 @@ import pytest
 
 import oodil
 from oodil.pipeline.config import RunConfig
-from oodil.pipeline.stage import Run
+from oodil.pipeline.stage import Run, stage_named
+from oodil.pipeline.stages.experts import ExpertsStage
 from tests.runs import MICRO
 
 pytestmark = pytest.mark.timeout(300)
@@ -77,6 +78,39 @@ def test_what_changes_a_result_makes_its_stage_stale_and_names_the_field(run_dir
 def test_a_mark_touches_the_oracle_alone(run_dir: Path) -> None:
     stale = {name for name, (state, _) in states(run_dir, MARKS).items() if state == "stale"}
     assert stale == {"marks", "oracle"}
+
+
+def test_a_mark_that_nothing_uses_touches_nothing(run_dir: Path) -> None:
+    opened = oodil.open_run(run_dir).run.directory
+    for mark in (MARKS, "demonstrations.sources.1.transferable=null"):
+        found = oodil.RunResults(Run(oodil.load_config(MICRO, ["baselines=[naive_gail]", mark]), opened)).states
+        assert set(found) >= {"demonstrations", "clustering", "imitators", "transferability", "imitation", "naive_gail"}
+        assert {state.state for state in found.values()} == {"done"}, mark
+
+
+def test_experts_alone_depend_on_how_they_are_trained() -> None:
+    """`expert_discount` is theirs; marks, labels and counts are not."""
+
+    def settings(*overrides: str) -> dict[str, object]:
+        return ExpertsStage().settings(oodil.load_config(MICRO, [BASELINES, *overrides]))
+
+    assert settings("demonstrations.sources.0.expert_discount=0.9") != settings()
+    assert settings("demonstrations.sources.0.dynamics.gravity=9.9") != settings()
+    for override in (MARKS, "demonstrations.sources.0.label=renamed", "demonstrations.sources.0.count=9"):
+        assert settings(override) == settings(), override
+
+
+def test_the_dynamics_of_the_imitator_collect_nothing_again(run_dir: Path) -> None:
+    """What experts return in it is measured anew; the demonstrations of each source are kept."""
+    override = "environment.dynamics.gravity=13"
+    assert states(run_dir, override)["demonstrations"] == ("stale", "imitator.gravity 12.0 -> 13.0")
+    kept, changed = (
+        Run(oodil.load_config(MICRO, [BASELINES, *more]), oodil.open_run(run_dir).run.directory)
+        for more in ((), (override,))
+    )
+    stage = stage_named("demonstrations")
+    for job in stage.jobs(kept):
+        assert stage.job_origin(changed, job) == stage.job_origin(kept, job)
 
 
 def fields(section: type, prefix: str = "") -> Iterator[str]:

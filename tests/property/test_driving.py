@@ -1,5 +1,7 @@
 """The driving world in its batched form against highway-env's own classes, over random worlds, drivers and episodes."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from oodil.pipeline.environments import make_batch
-from oodil.pipeline.environments.driving import GOAL, DrivingBatch, DrivingEnv, layout, touches
+from oodil.pipeline.environments.driving import GOAL, DrivingBatch, DrivingEnv, layout, observe, touches
 from oodil.pipeline.errors import OodilError
 from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.seeding import numpy_rng
@@ -84,6 +86,43 @@ def test_a_snapshot_continues_to_the_same_bits() -> None:
         assert one.env_rewards.tobytes() == two.env_rewards.tobytes()
     assert batch.snapshot().states.tobytes() == other.snapshot().states.tobytes()
     assert batch.episode_returns().tobytes() == other.episode_returns().tobytes()
+
+
+@pytest.mark.parametrize("steering", [0.3, -0.3])
+def test_the_heading_jumps_opposite_to_straight_ahead_alone(steering: float) -> None:
+    """A car that turns round once: its angle is that of its velocity, without a jump but at 3 pi / 2."""
+    batch = make_batch(ID, {}, 1)
+    batch.reset(0, 0)
+    start = batch.snapshot()
+    batch.restore(replace(start, states=np.array([[30.0, 12.0, np.pi / 2]])))
+    seen = [batch.observations()[0]]
+    while not len(seen) > 3 or abs(np.unwrap([row[4] for row in seen])[-1] - np.pi / 2) < 2 * np.pi:
+        batch.step(np.array([[steering]]))
+        seen.append(batch.observations()[0])
+    states = np.array(seen)
+    heading = states[:, 4]
+    assert (heading >= -np.pi / 2).all() and (heading < 1.5 * np.pi).all()
+    np.testing.assert_allclose(np.exp(1j * heading), states[:, 2] + 1j * states[:, 3], atol=1e-12)
+    (jump,) = np.flatnonzero(np.abs(np.diff(heading)) > 0.1)
+    np.testing.assert_allclose(states[jump : jump + 2, 3], -1, atol=0.01)  # it drives straight back
+
+
+@given(st.floats(-50, 50))
+def test_an_observed_heading_is_its_own_observation(heading: float) -> None:
+    """A car put where it was seen is seen there again, to the bit."""
+    here = np.array([0.0])
+    seen = observe(here, here, np.array([heading]), 1.0)
+    again = observe(here, here, seen[:, 4], 1.0)[:, 4]
+    assert again.tobytes() == seen[:, 4].tobytes() or abs(again[0] - seen[0, 4]) == 2 * np.pi
+    np.testing.assert_allclose(np.exp(1j * seen[0, 4]), np.exp(1j * heading), atol=1e-13)
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_no_demonstrator_drives_near_the_jump(name: str) -> None:
+    cars = make_batch(ID, SOURCES[name], 60)
+    episodes = run_episodes(cars, hand_written(cars, ID), numpy_rng((1,)), stochastic=False)
+    headings = np.concatenate([episode.states[:, 4] for episode in episodes])
+    assert headings.min() > 0 and headings.max() < np.pi
 
 
 @pytest.mark.parametrize("name", SOURCES)

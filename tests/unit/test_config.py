@@ -1,5 +1,6 @@
 """The configuration: every shipped file loads, and every mistake is answered by one line that helps."""
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from oodil.pipeline.config import (
     ClusteringConfig,
     ImitationConfig,
     PpoConfig,
+    RunConfig,
     TrainingConfig,
     TransferabilityConfig,
     TrpoConfig,
@@ -118,6 +120,8 @@ def test_an_override_wins_over_the_file_and_the_last_one_wins(write):
         ("seed.deeper=3", "seed is not a section"),
         ("demonstrations.sources.count=3", "count is not an entry of the list, which has 0 to 0"),
         ("demonstrations.sources.1.count=3", "1 is not an entry of the list, which has 0 to 0"),
+        ("demonstrations.sources.-1.count=3", "-1 is not an entry of the list, which has 0 to 0"),
+        ("baselines.0=oracle", "0 is not an entry of the list, which is empty"),
         ("seed=[1", r"'seed=\[1': the value is not valid YAML"),
         ("sed=3", "unknown key 'sed'; did you mean 'seed'"),
         ("runtime.wokers=3", "unknown key 'runtime.wokers'; did you mean 'workers'"),
@@ -125,7 +129,27 @@ def test_an_override_wins_over_the_file_and_the_last_one_wins(write):
 )
 def test_bad_overrides_are_refused(write, override, message):
     with pytest.raises(ConfigError, match=message):
-        load_config(write(values(seed=1)), [override])
+        load_config(write(values(seed=1, baselines=[])), [override])
+
+
+def keys(section, prefix=""):
+    """Yield the key of every field, sections included."""
+    for name, field in section.model_fields.items():
+        yield f"{prefix}{name}"
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from keys(field.annotation, f"{prefix}{name}.")
+
+
+ODD_VALUES = ["[]", "[paper]", "[[1]]", "[null]", "{}", "{a: 1}", "{1: 2}", "null", "x", "''", "-1", ".nan", "1e400"]
+ODD_VALUES += ["true", "2020-01-01", "!!set {a}", "!!binary aaaa", "99999999999999999999999"]
+
+
+@pytest.mark.parametrize("key", [*keys(RunConfig), "demonstrations.sources.0.dynamics", "clustering.preset"])
+def test_a_value_of_any_type_is_taken_or_refused(key):
+    """No value of a wrong type ends in anything but a message, wherever it stands."""
+    for value in ODD_VALUES:
+        with contextlib.suppress(ConfigError):
+            load_config(values(), [f"{key}={value}"])
 
 
 @pytest.mark.parametrize(

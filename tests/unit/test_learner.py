@@ -1,5 +1,6 @@
 """The learner: interrupted equals uninterrupted, the true reward stays out, and what enters each part."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -187,6 +188,29 @@ def test_normalizer_is_the_mean_and_deviation_of_all_observations(shown):
     together = torch.cat(parts).double().numpy()
     np.testing.assert_allclose(learner.policy.input_mean.numpy(), together.mean(axis=0), rtol=1e-5)
     np.testing.assert_allclose(learner.policy.input_scale.numpy(), 1 / together.std(axis=0), rtol=1e-5)
+
+
+@pytest.mark.parametrize("policy_optimizer", [TRPO, PPO], ids=["trpo", "ppo"])
+def test_an_expert_improves_the_policy_that_collected(policy_optimizer, monkeypatch):
+    """Without lag the ratio is one at the start of every update, although the normalizer moves all the time."""
+    learner = build(policy_optimizer=policy_optimizer, normalize_observations=True)
+    improve = learner.policy_optimizer.update
+    ratios, means = [], []
+
+    def update(observations, actions, log_probs, *rest):
+        with torch.no_grad():
+            present = learner.policy.log_prob(learner.policy(observations), actions)
+        ratios.append((present - log_probs).exp().numpy())
+        means.append(learner.policy.input_mean.numpy().copy())
+        return improve(observations, actions, log_probs, *rest)
+
+    monkeypatch.setattr(learner.policy_optimizer, "update", update)
+    train(learner, 0, 4)
+    # Log-densities are of order one and float32, summed over three actions.
+    np.testing.assert_allclose(np.stack(ratios), 1, rtol=1e-5)
+    means.append(learner.policy.input_mean.numpy())
+    assert all((before != after).any() for before, after in itertools.pairwise(means))
+    assert int(learner.state_dict()["moments"][0]) == 4 * 96
 
 
 def test_imitators_are_normalized_by_the_demonstrations_as_they_are_weighted(demonstrations):
