@@ -108,6 +108,10 @@ class Artifact:
         """Return the value of a JSON file, checked."""
         return json.loads(self.read(name))
 
+    def files(self) -> Files:
+        """Return the whole content, checked."""
+        return {name: self.read(name) for name in self.hashes}
+
     def verify(self) -> None:
         """Read every file. Raises DamagedArtifactError for the first that is not as written."""
         for name in self.hashes:

@@ -281,6 +281,18 @@ CLUSTERING_PRESETS: dict[str, dict[str, Any]] = {
 """What ``clustering.preset`` can stand for: the constants of the appendix, or the released code's reading."""
 
 
+class ReadingConfig(_Section):
+    """How it is read what an imitator reproduces: by fresh discriminators, trained on halves of demonstrations and
+    episodes, that read the other halves."""
+
+    steps: PositiveInt = 600
+    """Steps of each discriminator."""
+    batch_size: PositiveInt = 512
+    """Transitions from either side in a step."""
+    repetitions: PositiveInt = 4
+    """Times that other halves are drawn, two discriminators each."""
+
+
 class TransferabilityConfig(_Section):
     """One GAIL job per cluster, and how its discriminators are read."""
 
@@ -290,7 +302,8 @@ class TransferabilityConfig(_Section):
     final_steps: PositiveInt = 200
     """Steps that the discriminator takes against the finished imitator, which no longer learns, before it is read."""
     num_trainings: PositiveInt = 1
-    """Times an imitator of each cluster is trained, each with a seed of its own; the one that comes closest counts."""
+    """Trainings of each cluster's imitator, each with a seed of its own; the one whose transitions come closest to the
+    cluster's counts."""
     sharpening: float = Field(default=4.0, gt=0.0)
     """Power to which a transferability is raised to become a weight; 1 is the paper's form (docs/decisions.md)."""
 
@@ -303,10 +316,13 @@ class TransferabilityConfig(_Section):
 
 
 class ImitationConfig(_Section):
-    """The final policy."""
+    """The final policy, and every baseline."""
 
     gail: GailConfig
-    """Training of the final policy, and of every baseline."""
+    """Each training."""
+    num_trainings: PositiveInt = 2
+    """Trainings, each with a seed of its own; the policy whose transitions come closest to the weighted demonstrations'
+    is kept. They run side by side where there are no more workers than trainings."""
 
 
 class EvaluationConfig(_Section):

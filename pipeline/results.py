@@ -22,7 +22,7 @@ _ASSIGNMENT, _DIAGNOSTICS, _ENCODER = "assignment.safetensors", "diagnostics.jso
 _SCORES, _HISTORY, _SUMMARY = "transferability.safetensors", "history.safetensors", "summary.json"
 _POLICY, _POLICY_META, _DISCRIMINATOR = "policy.safetensors", "policy.json", "discriminator.safetensors"
 _CURVE, _EVALUATION = "curve.json", "evaluation.json"
-_IMITATORS, _JOB_SCORES = "imitators.json", "scores.safetensors"
+_IMITATORS, _JOB_SCORES, _TRAININGS = "imitators.json", "scores.safetensors", "trainings.json"
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -239,6 +239,35 @@ class Transferability:
             {"demonstration": n, **{name: column[n].item() for name, column in columns.items()}}
             for n in range(len(self.scores))
         ]
+
+
+@dataclass(frozen=True)
+class Training:
+    """One of several trainings of the same policy."""
+
+    job: str
+    env_steps: int
+    distance: float
+    """Of mean-action episodes to the weighted demonstrations, see `AdversarialReward.distance`; the smallest counts."""
+    mean_return: float
+    """True return of the final evaluation; for reporting only."""
+
+
+@dataclass(frozen=True)
+class Trainings:
+    """All trainings of a policy."""
+
+    trainings: tuple[Training, ...]
+    """The one that was kept is the first."""
+
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        return {_TRAININGS: encode_json([vars(training) for training in self.trainings])}
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        return cls(tuple(Training(**training) for training in artifact.json(_TRAININGS)))
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,9 @@ _PRELOAD = (
 class LocalEngine:
     """Runs jobs on this machine: in ``workers`` processes, or with 0 in this one.
 
-    A distributed stage has one learner process, and ``workers`` rollout workers beside it; with ``access`` others may
-    join them from elsewhere (`oodil.workers.remote`). Raises ConfigError for a negative number of workers.
+    A distributed stage has one learner process, and ``workers`` rollout workers beside it, unless it has as many jobs
+    as there are workers; with ``access`` others may join them from elsewhere (`oodil.workers.remote`). Raises
+    ConfigError for a negative number of workers.
     """
 
     def __init__(self, workers: int, access: Access | None = None) -> None:
@@ -55,21 +56,23 @@ class LocalEngine:
             _run_inline(stage, run, jobs, ledger, should_stop)
             return ledger.outcome()
         refuse_main(stage)
+        # As many jobs as cores are done soonest side by side: what a job collects itself needs no messages.
+        distributed = stage.distributed and (self._access is not None or len(jobs) == 1 or len(jobs) < self._workers)
         with (
-            private_endpoint(run.directory.path) if stage.distributed else nullcontext("") as endpoint,
+            private_endpoint(run.directory.path) if distributed else nullcontext("") as endpoint,
             Supervisor(run.directory.logs(), stage.name, _PRELOAD) as supervisor,
         ):
             path = str(run.directory.path.absolute())
             arguments = {"run_path": path, "stage": stage.name, "module": stage.module}
             workers: dict[str, dict[str, str]] = {}
-            if stage.distributed:
+            if distributed:
                 shared = {"endpoint": endpoint, "run_id": uuid.uuid4().hex}
                 if self._access is not None:
                     shared["keys"] = str(self._access.keys)
                     arguments["address"] = self._access.address
                 arguments |= shared
                 workers = {f"{_WORKER}{index}": shared for index in range(self._workers)}
-            parallel = 1 if stage.distributed else self._workers
+            parallel = 1 if distributed else self._workers
             processes = _Processes(supervisor, run.config.runtime, ledger, arguments, workers, on_event)
             processes.run(jobs, parallel, should_stop)
         return ledger.outcome()

@@ -6,6 +6,8 @@ cluster equally, naive GAIL weighs all demonstrations equally, and the method we
 Letters: N demonstrations, M transitions of all of them, B policy pairs, S observation.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,13 +18,17 @@ from oodil.pipeline.algorithms.discriminator import (
     imitation_reward,
     mean_logit_per_demonstration,
 )
+from oodil.pipeline.algorithms.divergence import sliced_wasserstein
 from oodil.pipeline.algorithms.learner import Learner
 from oodil.pipeline.algorithms.standardization import standardization
 from oodil.pipeline.artifacts import below, nested
 from oodil.pipeline.config import DiscriminatorConfig, GailConfig
-from oodil.pipeline.data import Demonstrations, TransitionBatch
+from oodil.pipeline.data import Demonstrations, Episode, TransitionBatch
 from oodil.pipeline.errors import DataError
 from oodil.pipeline.seeding import derive_key, numpy_rng, torch_seed
+
+DISTANCE_TRANSITIONS = 10_000
+"""Drawn from the demonstrations to measure how far an imitator is from them."""
 
 
 class AdversarialReward:
@@ -60,8 +66,12 @@ class AdversarialReward:
     def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
         """Return (T, G) rewards; `Learner` asks for them before the discriminator's step of the same iteration."""
         logits = self.discriminator(self._inputs_of(batch))
-        rewards = imitation_reward(logits, self.discriminator.config.reward).numpy()
-        return rewards.reshape(batch.terminated.shape)
+        rewards = imitation_reward(logits, self.discriminator.config.reward).numpy().reshape(batch.terminated.shape)
+        import os
+
+        if os.environ.get("PERSIST"):
+            rewards = np.where(batch.terminated, rewards * 200, rewards)
+        return rewards
 
     def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
         """Train the discriminator on the batch, a part of it at each step, and on as many demonstration pairs."""
@@ -87,6 +97,17 @@ class AdversarialReward:
         for _ in range(steps):
             chosen = torch.from_numpy(rng.integers(len(policy_inputs), size=batch_size))
             self.discriminator.update(self.draw(batch_size, rng), policy_inputs[chosen])
+
+    def distance(self, episodes: Sequence[Episode]) -> float:
+        """Return how far episodes are from the weighted demonstrations, in deviations of what the discriminator sees.
+
+        It is the sliced Wasserstein distance of their transitions, which asks for no reward and for no discriminator.
+        """
+        rng = numpy_rng(derive_key(self.root_seed, "distance"))
+        shown = self.draw(DISTANCE_TRANSITIONS, rng)
+        states = np.concatenate([episode.states[:-1] for episode in episodes]).astype(np.float32)
+        successors = np.concatenate([episode.states[1:] for episode in episodes]).astype(np.float32)
+        return sliced_wasserstein(shown.numpy(), self.discriminator.inputs(states, successors).numpy(), rng)
 
     def draw(self, count: int, rng: np.random.Generator) -> Tensor:
         """Draw ``count`` demonstration pairs with replacement, in proportion to the weights."""

@@ -1,19 +1,26 @@
 """Stage 5: a policy, by GAIL on weighted demonstrations (Eqn 7 and 8); policies differ in their weightings alone."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodil.pipeline.artifacts import Files
-from oodil.pipeline.config import RunConfig
-from oodil.pipeline.environments import environment_spec
-from oodil.pipeline.evaluation import evaluate
-from oodil.pipeline.results import LearningCurve, Policy, discriminator_file
-from oodil.pipeline.seeding import derive_key, torch_seed
+from oodil.pipeline.config import EnvironmentConfig, RunConfig
+from oodil.pipeline.environments import environment_spec, make_batch
+from oodil.pipeline.evaluation import evaluate, run_episodes
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.results import LearningCurve, Policy, Training, Trainings, discriminator_file
+from oodil.pipeline.seeding import derive_key, numpy_rng, torch_seed
 from oodil.pipeline.stage import JobContext, Run, Stage, register, stage_named
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 from oodil.pipeline.stages.weighting import Weighting
+
+if TYPE_CHECKING:
+    from oodil.pipeline.algorithms.gail import AdversarialReward
+
+DISTANCE_EPISODES = 16
+"""Mean-action episodes that a policy's distance is measured with."""
 
 
 class PolicyStage(Stage):
@@ -22,7 +29,7 @@ class PolicyStage(Stage):
     A competing method is an instance with a weighting of its own, registered beside it.
     """
 
-    version = 2
+    version = 3
     distributed = True
 
     def __init__(self, name: str, title: str, weighting: str | None) -> None:
@@ -44,12 +51,21 @@ class PolicyStage(Stage):
         return super().module if self.weighting is None else stage_named(self.weighting).module
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
-        """Return the section and the imitator's environment."""
-        return config.imitation.model_dump(mode="json") | {"environment": config.environment.model_dump()}
+        """Return the number of trainings and what each depends on."""
+        return self.job_settings(config) | {"num_trainings": config.imitation.num_trainings}
+
+    def job_settings(self, config: RunConfig) -> dict[str, Any]:
+        """Return what a training depends on."""
+        gail = config.imitation.gail.model_dump(mode="json")
+        return {"gail": gail, "environment": config.environment.model_dump()}
+
+    def jobs(self, run: Run) -> list[str]:
+        """Return the trainings."""
+        return [f"training-{n}" for n in range(1, run.config.imitation.num_trainings + 1)]
 
     def env_steps(self, run: Run) -> int:
-        """Return the environment steps of the training."""
-        return Policy.load(run.artifact(self.name)).env_steps
+        """Return the environment steps of all trainings."""
+        return sum(training.env_steps for training in Trainings.load(run.artifact(self.name)).trainings)
 
     def weights(self, run: Run) -> NDArray[np.float64]:
         """Return (N,) weights of the demonstrations."""
@@ -67,8 +83,8 @@ class PolicyStage(Stage):
         config, evaluation = run.config, run.config.evaluation
         environment, gail = config.environment, config.imitation.gail
         spec = environment_spec(environment.id, environment.dynamics)
-        # The same seed for all policies: they differ in their weights alone.
-        seed = torch_seed(derive_key(config.seed, "imitation"))
+        # The same seeds for all policies: they differ in their weights alone.
+        seed = torch_seed(derive_key(config.seed, "imitation", job))
         demonstrations, weights = load_demonstrations(run), self.weights(run)
         learner = imitator(spec.observation_dim, spec.action_dim, demonstrations, weights, gail, seed)
 
@@ -91,8 +107,27 @@ class PolicyStage(Stage):
         curve = LearningCurve(history.steps("curve"), mean, std, length, evaluation.episodes)
         key = derive_key(config.seed, "final")
         final = evaluate(policy.gaussian, environment.id, environment.dynamics, evaluation.final_episodes, key)
+        distance = distance_of(policy.gaussian, learner.reward_model, environment, seed)
+        training = Training(job, policy.env_steps, distance, final.mean_return)
         discriminator = discriminator_file(learner.reward_model.discriminator_arrays())
-        return policy.files() | discriminator | curve.files() | final.files()
+        return policy.files() | discriminator | curve.files() | final.files() | Trainings((training,)).files()
+
+    def combine(self, run: Run) -> Files:
+        """Keep the training whose policy comes closest to the weighted demonstrations; returns play no part."""
+        artifacts = {job: run.job_artifact(self.name, job) for job in self.jobs(run)}
+        trainings = [Trainings.load(artifact).trainings[0] for artifact in artifacts.values()]
+        kept = min(trainings, key=lambda training: training.distance)
+        ordered = (kept, *(training for training in trainings if training is not kept))
+        return artifacts[kept.job].files() | Trainings(ordered).files()
+
+
+def distance_of(
+    policy: GaussianPolicy, reward: "AdversarialReward", environment: EnvironmentConfig, seed: int
+) -> float:
+    """Return how far fresh episodes of mean actions are from the demonstrations that a reward model was made for."""
+    simulators = make_batch(environment.id, environment.dynamics, DISTANCE_EPISODES)
+    episodes = run_episodes(simulators, policy, numpy_rng(derive_key(seed, "distance")), stochastic=False)
+    return reward.distance(episodes)
 
 
 register(PolicyStage("imitation", title="ours", weighting="transferability"))
