@@ -1,9 +1,9 @@
 """What the check ``reproducibility`` says of Hopper, Walker2d and HalfCheetah, and how long it takes on one core.
 
 Demonstrations of the sources of three configurations are followed by the simulator of each one's imitator. By source:
-mean, median and the distances that three of four and nine of ten trials keep, after one step and after several; how large a part of the
-states does not tell where a simulator is, because a velocity was clipped. By environment: AUROC of the demonstrations'
-mean distances against the marks.
+mean, median and the distances that three of four and nine of ten trials keep, after one step and after several; how
+large a part of the states does not tell where a simulator is, because a velocity was clipped. By environment: AUROC of
+the demonstrations' mean distances against the marks.
 
 Run ``python benchmarks/reproducibility.py --json FILE``.
 """
@@ -55,7 +55,7 @@ def measure(name: str, count: int, section: ReproducibilityConfig) -> dict[str, 
     told = make_batch(environment.id, environment.dynamics, 1).tells_state(demonstrations.observations)
     states_of = np.repeat(demonstrations.sources, demonstrations.lengths)
     marks = np.array([source.transferable is True for source in sources])[demonstrations.sources]
-    reproducible = found.reproducible_sources(Demonstrations.joined(parts))
+    reproducible = found.reproducible_sources(demonstrations)
     rows = []
     for i, source in enumerate(sources):
         mine = demonstrations.sources == i
