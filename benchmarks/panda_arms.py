@@ -18,7 +18,7 @@ from common import arguments_of, circumstances, one_thread, save
 from numpy.typing import NDArray
 
 from oodil.pipeline.environments import make_batch, panda
-from oodil.pipeline.environments.panda import ALL_JOINTS, BOX_START, TIME_STEP, Arm, Floats
+from oodil.pipeline.environments.panda import ALL_JOINTS, BOX_START, TIME_STEP, Arm
 from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.seeding import numpy_rng
 from oodil.pipeline.stages.demonstrations import hand_written
@@ -27,39 +27,17 @@ ENV_ID = "oodil/Panda-v0"
 FOLLOWED_BY = {(1, 3): [(1, 3), (1,), (), (6,), (4,)], (1, 3, 4): [(1, 3), (4,)]}
 """Locked joints of imitators, and of the demonstrators that each is to follow."""
 LOOK_AHEAD = 24
-STARTS = 6
-
-
-def toward(arm: Arm, data: mujoco.MjData, velocity: Floats) -> Floats:
-    """Return (J,) turning that moves the hand with ``velocity``, by damped least squares."""
-    jacobian = arm.jacobian(data)
-    return np.asarray(jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-3 * np.eye(3), velocity))
-
-
-def placed(arm: Arm, hand: Floats) -> mujoco.MjData:
-    """Return the arm with its hand as near to ``hand`` as it gets without touching anything, from several starts."""
-    found: list[tuple[float, mujoco.MjData]] = []
-    for seed in range(STARTS):
-        data = mujoco.MjData(arm.model)
-        arm.start(data, np.random.default_rng(seed))
-        for _ in range(300):
-            mujoco.mj_kinematics(arm.model, data)
-            turned = data.qpos[arm.angles] + 0.3 * toward(arm, data, hand - arm.hand(data))
-            data.qpos[arm.angles] = np.clip(turned, arm.low, arm.high)
-        mujoco.mj_forward(arm.model, data)
-        data.ctrl[:] = data.qpos[arm.angles]
-        found.append((float(np.linalg.norm(hand - arm.hand(data))) + (not arm.is_before_box(data)), data))
-    return min(found, key=lambda each: each[0])[1]
 
 
 def follow(arm: Arm, states: NDArray[np.floating]) -> tuple[float, float]:
     """Return the mean distance of the hand from a demonstration's, and by how much the box falls short of its end."""
     hands = states[:, :3].astype(np.float64)
-    data = placed(arm, hands[0])
+    data = mujoco.MjData(arm.model)
+    arm.place(data, hands[0], states[0, 3:].astype(np.float64))
     errors = []
     for t in range(len(hands) - 1):
         ahead = hands[min(t + LOOK_AHEAD, len(hands) - 1)]
-        turning = toward(arm, data, (ahead - arm.hand(data)) / (LOOK_AHEAD * TIME_STEP))
+        turning = arm.toward(data, (ahead - arm.hand(data)) / (LOOK_AHEAD * TIME_STEP))
         arm.move(data, (data.qpos[arm.angles] + turning - data.ctrl) / TIME_STEP)
         errors.append(np.linalg.norm(hands[t + 1] - arm.hand(data)))
     return float(np.mean(errors)), float(states[-1, 3] - arm.observe(data)[3])

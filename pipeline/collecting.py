@@ -57,9 +57,16 @@ def collect(unit: Unit) -> UnitResult:
     rng = numpy_rng(unit.key)
     shape = (unit.num_steps, unit.num_simulators)
     noise = rng.standard_normal((*shape, simulators.action_dim), dtype=np.float32)
+
+    def begin(simulator: int) -> None:
+        if unit.starts is None:
+            simulators.reset(simulator, seed=int(rng.integers(2**31)))
+        else:
+            simulators.place(simulator, unit.starts[rng.integers(len(unit.starts))])
+
     if unit.snapshot is None:
         for g in range(unit.num_simulators):
-            simulators.reset(g, seed=int(rng.integers(2**31)))
+            begin(g)
     else:
         simulators.restore(unit.snapshot)
 
@@ -86,7 +93,7 @@ def collect(unit: Unit) -> UnitResult:
             returns.extend(simulators.episode_returns()[ended].tolist())
             lengths.extend(simulators.elapsed_steps()[ended].tolist())
             for g in ended.tolist():
-                simulators.reset(g, seed=int(rng.integers(2**31)))
+                begin(g)
             current = simulators.observations()
 
     rollout = Rollout(

@@ -315,6 +315,18 @@ class TransferabilityConfig(_Section):
         return values
 
 
+class ReproducibilityConfig(_Section):
+    """How closely the imitator's simulator can follow the demonstrations, by physics and without learning. Nothing
+    else depends on it. The environment has to be one that can be put into an observed state."""
+
+    transitions: PositiveInt = 8
+    """Trials of each demonstration."""
+    horizon: PositiveInt = 4
+    """Steps that a trial follows it."""
+    iterations: PositiveInt = 4
+    """Gauss-Newton steps with which each action is sought."""
+
+
 class ImitationConfig(_Section):
     """The final policy, and every baseline."""
 
@@ -373,6 +385,8 @@ class RunConfig(_Section):
     """Modes of the demonstrations."""
     transferability: TransferabilityConfig
     """What the imitator can reproduce."""
+    reproducibility: ReproducibilityConfig | None = None
+    """A physical check of the demonstrations, beside the method; without this section there is none."""
     imitation: ImitationConfig
     """The final policy."""
     baselines: tuple[str, ...] = ()

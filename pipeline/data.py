@@ -185,6 +185,9 @@ class Unit:
     key: Key
     snapshot: Snapshot | None
     """Where the group stands; None starts every simulator with a fresh episode."""
+    starts: NDArray[np.float32] | None = None
+    """(P, S) observations; every fresh episode begins at one of them, drawn evenly. None leaves it to the environment.
+    They travel with each unit, so a few thousand are many."""
 
 
 @dataclass(frozen=True)

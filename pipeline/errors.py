@@ -18,7 +18,7 @@ class ExpertError(OodilError):
 
 
 class UnusableEnvironmentError(OodilError):
-    """An environment that cannot be made, or that cannot be learned in; the message names its id."""
+    """An environment that cannot be made, learned in, or put where it should be; the message names its id."""
 
 
 class NotFinishedError(OodilError):

@@ -2,7 +2,8 @@
 
 ``files()`` gives the content of an artifact, ``load(artifact)`` reads it back, checked against the manifest.
 
-Letters: N demonstrations, E embedding or episodes, K clusters, M points along a training, S observation, A action.
+Letters: N demonstrations, E embedding or episodes, K clusters, M points along a training, or trials, S observation,
+A action.
 """
 
 from dataclasses import dataclass, field, fields
@@ -23,6 +24,7 @@ _SCORES, _HISTORY, _SUMMARY = "transferability.safetensors", "history.safetensor
 _POLICY, _POLICY_META, _DISCRIMINATOR = "policy.safetensors", "policy.json", "discriminator.safetensors"
 _CURVE, _EVALUATION = "curve.json", "evaluation.json"
 _IMITATORS, _JOB_SCORES, _TRAININGS = "imitators.json", "scores.safetensors", "trainings.json"
+_RESIDUALS = "residuals.safetensors"
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -125,6 +127,72 @@ def cluster_model_files(arrays: Arrays) -> Files:
 def load_cluster_model(artifact: Artifact) -> Arrays:
     """Return what `ClusterModel.from_arrays` takes."""
     return artifact.arrays(_ENCODER)
+
+
+@dataclass(frozen=True)
+class Reproducibility:
+    """How far the imitator's simulator stays from the demonstrations that it follows with the best actions there are.
+
+    A distance is the root mean square over state dimensions, in deviations of what states change by in that time. It
+    depends on no return and on nothing learned. NaN: no state of the demonstration tells where the simulator is.
+    """
+
+    one_step: NDArray[np.float64]
+    """(N, M) distances after one step, for M trials of each demonstration."""
+    horizon: NDArray[np.float64]
+    """(N, M) distances after several steps."""
+    env_steps: int = 0
+    """Steps of the simulator that it took."""
+
+    SHARE, LIMIT = 0.75, 0.05
+    """A source is reproducible if this share of its trials ends, after one step, within this distance. Not the mean,
+    and not all: where every step can be reproduced, the search fails in up to an eighth of the trials. Not half: feet
+    that slip are the smaller part of the steps (docs/decisions.md)."""
+
+    def mean(self) -> NDArray[np.float64]:
+        """Return (N,) the mean distance after one step of each demonstration."""
+        return np.asarray(self.one_step.mean(axis=1))
+
+    def median(self) -> NDArray[np.float64]:
+        """Return (N,) the median distance after one step of each demonstration."""
+        return np.asarray(np.median(self.one_step, axis=1))
+
+    def horizon_mean(self) -> NDArray[np.float64]:
+        """Return (N,) the mean distance after several steps of each demonstration."""
+        return np.asarray(self.horizon.mean(axis=1))
+
+    def horizon_median(self) -> NDArray[np.float64]:
+        """Return (N,) the median distance after several steps of each demonstration."""
+        return np.asarray(np.median(self.horizon, axis=1))
+
+    def by_source(self, demonstrations: Demonstrations) -> dict[str, float]:
+        """Return by source the distance, after one step, that `SHARE` of its trials keep; NaN where none is known."""
+        found = {}
+        for source, label in enumerate(demonstrations.source_labels):
+            trials = self.one_step[demonstrations.sources == source]
+            trials = trials[np.isfinite(trials)]
+            found[label] = float(np.quantile(trials, self.SHARE)) if trials.size else float("nan")
+        return found
+
+    def reproducible_sources(self, demonstrations: Demonstrations) -> dict[str, bool]:
+        """Return by source whether it is reproducible; what is not known is not."""
+        return {label: kept <= self.LIMIT for label, kept in self.by_source(demonstrations).items()}
+
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        arrays: Arrays = {"one_step": self.one_step, "horizon": self.horizon}
+        return {_RESIDUALS: encode_arrays(arrays), _SUMMARY: encode_json({"env_steps": self.env_steps})}
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        return cls(**artifact.arrays(_RESIDUALS), env_steps=artifact.json(_SUMMARY)["env_steps"])
+
+    @classmethod
+    def joined(cls, parts: "list[Reproducibility]") -> Self:
+        """Return that of several sets of demonstrations, one after the other."""
+        one_step, horizon = (np.concatenate([getattr(p, name) for p in parts]) for name in ("one_step", "horizon"))
+        return cls(one_step, horizon, sum(part.env_steps for part in parts))
 
 
 @dataclass(frozen=True)

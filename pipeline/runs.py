@@ -23,6 +23,7 @@ from oodil.pipeline.results import (
     Evaluation,
     LearningCurve,
     Policy,
+    Reproducibility,
     Transferability,
 )
 from oodil.pipeline.stage import Run, StageState, state_of
@@ -96,6 +97,11 @@ class RunResults:
     def cluster_diagnostics(self) -> ClusterDiagnostics:
         """How good the clusters are."""
         return ClusterDiagnostics.load(self.artifact("clustering"))
+
+    @property
+    def reproducibility(self) -> Reproducibility:
+        """How closely the imitator's simulator can follow every demonstration."""
+        return Reproducibility.load(self.artifact("reproducibility"))
 
     @property
     def transferability(self) -> Transferability:
@@ -188,7 +194,9 @@ class RunResults:
         """Return the results known so far, as JSON values.
 
         ``policies`` by name: mean and std of the return, episodes, env_steps; ``weightings`` by name: see `separation`;
-        ``purity``; ``env_steps`` and ``seconds`` of everything that was run. What is not known is left out.
+        ``purity``; ``reproducibility`` with the distance of each source in ``sources``, those that count as
+        ``reproducible`` and whether that is ``everything``; ``env_steps`` and ``seconds`` of all that was run. What is
+        not known is left out.
         """
         policies, weightings = {}, {}
         for policy in self.policies:
@@ -203,9 +211,19 @@ class RunResults:
         for weighting in self.weightings:
             if self.is_done(weighting.name) and self.is_done("demonstrations"):
                 weightings[weighting.name] = self.separation(weighting.name)
+        reproducibility: dict[str, Any] = {}
+        if self.is_done("reproducibility") and self.is_done("demonstrations"):
+            known = self.reproducibility
+            chosen = known.reproducible_sources(self.demonstrations)
+            reproducibility = {
+                "sources": known.by_source(self.demonstrations),
+                "reproducible": [label for label, is_reproducible in chosen.items() if is_reproducible],
+                "everything": all(chosen.values()),
+            }
         found: dict[str, Any] = {
             "policies": policies,
             "weightings": {name: figures for name, figures in weightings.items() if figures},
+            "reproducibility": reproducibility,
             "purity": self.cluster_diagnostics.purity if self.is_done("clustering") else None,
             "env_steps": sum(self.env_steps().values()),
             "seconds": sum(self.seconds().values()),

@@ -88,6 +88,7 @@ class _Position:
     """Collects the next iteration."""
     snapshots: list[Snapshot | None]
     history: History
+    starts: NDArray[np.float32] | None
 
     def unit(self, group: int, root_seed: int, environment: EnvironmentConfig, config: TrainingConfig) -> Unit:
         """Return the unit of a group in the next iteration."""
@@ -102,6 +103,7 @@ class _Position:
             policy=self.policy,
             key=derive_key(root_seed, "rollout", group, self.iteration),
             snapshot=self.snapshots[group],
+            starts=self.starts,
         )
 
 
@@ -112,8 +114,11 @@ def train(
     probes: list[Probe],
     context: JobContext,
     checkpoints: Checkpoints,
+    starts: NDArray[np.float32] | None = None,
 ) -> History:
     """Train for the configured number of steps, from the newest checkpoint if there is one.
+
+    Episodes begin at ``starts`` (P, S), if there are any; see `Unit`.
 
     Each iteration reports to the context the metrics of `Learner.update`, and the mean ``return`` and ``length`` of the
     last hundred episodes of training once one has ended.
@@ -121,7 +126,7 @@ def train(
     Raises JobStoppedError, after writing a checkpoint, when the context asks for a stop.
     """
     torch.set_num_threads(config.torch_threads)
-    position = _resume(learner, config, context, checkpoints)
+    position = _resume(learner, config, context, checkpoints, starts)
 
     def unit(group: int) -> Unit:
         return position.unit(group, learner.root_seed, environment, config)
@@ -178,9 +183,13 @@ def experience(
     num_steps: int,
     root_seed: int,
     context: JobContext,
+    starts: NDArray[np.float32] | None = None,
 ) -> TransitionBatch:
-    """Collect at least ``num_steps`` steps of every simulator under one policy, starting with new episodes."""
-    position = _Position(0, 0, policy, [None] * config.num_groups, History())
+    """Collect at least ``num_steps`` steps of every simulator under one policy, starting with new episodes.
+
+    They begin at ``starts`` (P, S), if there are any; see `Unit`.
+    """
+    position = _Position(0, 0, policy, [None] * config.num_groups, History(), starts)
     seed = torch_seed(derive_key(root_seed, "experience"))
     rollouts = []
     while position.iteration * config.steps_per_rollout < num_steps:
@@ -226,16 +235,22 @@ def _save(learner: Learner, position: _Position, checkpoints: Checkpoints) -> No
     checkpoints.save(position.iteration, arrays)
 
 
-def _resume(learner: Learner, config: TrainingConfig, context: JobContext, checkpoints: Checkpoints) -> _Position:
+def _resume(
+    learner: Learner,
+    config: TrainingConfig,
+    context: JobContext,
+    checkpoints: Checkpoints,
+    starts: NDArray[np.float32] | None,
+) -> _Position:
     """Load the newest checkpoint into the learner and return its position; the initial one if there is none."""
     arrays, warnings = checkpoints.load()
     for warning in warnings:
         context.warn(warning)
     if arrays is None:
         fresh: list[Snapshot | None] = [None] * config.num_groups
-        return _Position(0, 0, learner.behavior_policy(), fresh, History())
+        return _Position(0, 0, learner.behavior_policy(), fresh, History(), starts)
     learner.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in below("learner", arrays).items()})
     iteration, version = (int(value) for value in arrays["position"])
     snapshots: list[Snapshot | None] = [Snapshot(**below(f"snapshot/{g}", arrays)) for g in range(config.num_groups)]
     policy = GaussianPolicy.from_arrays(below("policy", arrays))
-    return _Position(iteration, version, policy, snapshots, History.from_arrays(below("history", arrays)))
+    return _Position(iteration, version, policy, snapshots, History.from_arrays(below("history", arrays)), starts)

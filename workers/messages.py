@@ -4,7 +4,7 @@ A message is a list of frames: a msgpack header that declares fields and arrays,
 Decoding gives a message or raises MessageError: names, types, shapes and lengths must be exactly those declared here.
 No memory is reserved on the word of a header; arrays are views into the frames that arrived.
 
-Letters: T steps, G simulators, S observation, A action, E ended episodes, N numbers of a simulator's state.
+Letters: T steps, G simulators, S observation, A action, E ended episodes, P starts, N numbers of a simulator's state.
 """
 
 import math
@@ -32,7 +32,7 @@ from oodil.workers.wire import (
     unpack,
 )
 
-SCHEMA = 2
+SCHEMA = 3
 """Raise it when the meaning of a message changes; other versions are refused."""
 MAX_FRAMES = 64
 MAX_FRAME_BYTES = 256 * 1024 * 1024
@@ -139,6 +139,7 @@ _ARRAYS: dict[str, dict[str, tuple[str, str]]] = {
         "policy.log_std": ("<f4", "A"),
         "policy.input_mean": ("<f4", "S"),
         "policy.input_scale": ("<f4", "S"),
+        "starts": ("<f4", "PS"),
         **_SNAPSHOT,
     },
     "ResultMessage": {
@@ -196,6 +197,7 @@ def _take_apart(message: Message) -> tuple[dict[str, Any], Arrays]:
         unit = message.unit
         values = {name: getattr(unit, name) for name in _UNIT} | {"dynamics": dict(unit.dynamics)}
         arrays = {f"policy.{name}": array for name, array in unit.policy.arrays().items()}
+        arrays |= {} if unit.starts is None else {"starts": unit.starts}
         return values, arrays | (_arrays_of("snapshot", unit.snapshot) if unit.snapshot else {})
     if isinstance(message, ResultMessage):
         result = message.result
@@ -214,7 +216,8 @@ def _put_together(kind: str, header: Header, values: dict[str, Any], arrays: Arr
             values["dynamics"] = tuple(values["dynamics"].items())
             policy = GaussianPolicy.from_arrays(_below("policy.", arrays))
             states = _below("snapshot.", arrays)
-            return UnitMessage(header, Unit(**values, policy=policy, snapshot=Snapshot(**states) if states else None))
+            snapshot, starts = Snapshot(**states) if states else None, arrays.get("starts")
+            return UnitMessage(header, Unit(**values, policy=policy, snapshot=snapshot, starts=starts))
         if kind == "ResultMessage":
             rollout = Rollout(policy_version=values.pop("policy_version"), **_below("rollout.", arrays))
             return ResultMessage(header, UnitResult(**values, rollout=rollout, snapshot=_snapshot(arrays)))

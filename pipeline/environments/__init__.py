@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from oodil.pipeline.environments.batch import Simulators, stop_the_clock
 from oodil.pipeline.environments.registration import register_environments
-from oodil.pipeline.environments.replay import ReplayBatch, box_spaces, refuse_randomness
+from oodil.pipeline.environments.replay import ReplayBatch, box_spaces, can_be_placed, refuse_randomness, unplaceable
 from oodil.pipeline.errors import UnusableEnvironmentError
 
 register_environments()
@@ -31,6 +31,8 @@ class EnvironmentSpec:
     action_low: NDArray[np.float32]
     """In the shape of the action space."""
     action_high: NDArray[np.float32]
+    can_be_placed: bool
+    """Whether its simulators can be put into an observed state (`Simulators.place`)."""
 
 
 def environment_spec(env_id: str, dynamics: Mapping[str, float]) -> EnvironmentSpec:
@@ -38,7 +40,8 @@ def environment_spec(env_id: str, dynamics: Mapping[str, float]) -> EnvironmentS
     env, limit = _make(env_id, dynamics)
     seen, action = box_spaces(env)
     low, high = np.asarray(action.low, np.float32), np.asarray(action.high, np.float32)
-    return EnvironmentSpec(math.prod(seen.shape), math.prod(action.shape), limit, seen.shape, low, high)
+    placeable = hasattr(env.unwrapped, "batched") or can_be_placed(env)
+    return EnvironmentSpec(math.prod(seen.shape), math.prod(action.shape), limit, seen.shape, low, high, placeable)
 
 
 def make_batch(env_id: str, dynamics: Mapping[str, float], num_simulators: int) -> Simulators:
@@ -87,4 +90,4 @@ def _make(env_id: str, dynamics: Mapping[str, float]) -> tuple[gymnasium.Env[Any
     return env, limit
 
 
-__all__ = ["EnvironmentSpec", "Simulators", "check_environment", "environment_spec", "make_batch"]
+__all__ = ["EnvironmentSpec", "Simulators", "check_environment", "environment_spec", "make_batch", "unplaceable"]

@@ -41,6 +41,15 @@ class Simulators(Protocol):
     def reset(self, simulator: int, seed: int) -> None:
         """Start a new episode in one simulator."""
 
+    def place(self, simulator: int, observation: NDArray[np.floating]) -> None:
+        """Start a new episode in one simulator where (S,) is observed, as far as that tells its state.
+
+        Raises UnusableEnvironmentError for an environment that cannot do it.
+        """
+
+    def tells_state(self, observations: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return (N,) whether each of (N, S) observations tells the whole state, so that `place` is exact."""
+
     def step(self, actions: NDArray[np.floating]) -> StepOutcome:
         """Apply (G, A) actions for one control step."""
 
@@ -85,12 +94,20 @@ class MujocoBatch(ABC):
         """Return (G, S) observations of the present states."""
 
     @abstractmethod
+    def tells_state(self, observations: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return (N,) whether each of (N, S) observations tells the whole state, so that `place` is exact."""
+
+    @abstractmethod
     def step(self, actions: NDArray[np.floating]) -> StepOutcome:
         """Apply (G, A) actions for one control step in every simulator."""
 
     @abstractmethod
     def _start(self, data: mujoco.MjData, seed: int) -> None:
         """Put one simulator where ``gymnasium.make(...).reset(seed=seed)`` would."""
+
+    @abstractmethod
+    def _put(self, data: mujoco.MjData, observation: NDArray[np.float64]) -> None:
+        """Put one simulator, just reset, where (S,) is observed."""
 
     @abstractmethod
     def _read(self, simulator: int) -> None:
@@ -100,6 +117,15 @@ class MujocoBatch(ABC):
         """Start a new episode in one simulator, as ``gymnasium.make(...).reset(seed=seed)`` would."""
         mujoco.mj_resetData(self.model, self._data[simulator])
         self._start(self._data[simulator], seed)
+        self._begin(simulator)
+
+    def place(self, simulator: int, observation: NDArray[np.floating]) -> None:
+        """Start a new episode in one simulator where (S,) is observed."""
+        mujoco.mj_resetData(self.model, self._data[simulator])
+        self._put(self._data[simulator], observation.astype(np.float64))
+        self._begin(simulator)
+
+    def _begin(self, simulator: int) -> None:
         self._read(simulator)
         self._elapsed[simulator] = 0
         self._returns[simulator] = 0.0

@@ -226,7 +226,19 @@ class DrivingBatch:
     def reset(self, simulator: int, seed: int) -> None:
         """Put a new car on the start line, where ``gymnasium.make(...).reset(seed=seed)`` would."""
         rng, _ = np_random(seed)
-        self._x[simulator], self._y[simulator], self._heading[simulator] = draw_start(rng)
+        self._put(simulator, *draw_start(rng))
+
+    def place(self, simulator: int, observation: NDArray[np.floating]) -> None:
+        """Put a new car where (5,) is observed; its speed is this world's, whatever was observed."""
+        east, north, _, _, heading = observation.astype(np.float64).tolist()
+        self._put(simulator, (east / 2 + 0.5) * WIDTH, (north / 2 + 0.5) * HEIGHT, heading)
+
+    def tells_state(self, observations: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return (N,) that all do."""
+        return np.ones(len(observations), np.bool_)
+
+    def _put(self, simulator: int, x: float, y: float, heading: float) -> None:
+        self._x[simulator], self._y[simulator], self._heading[simulator] = x, y, heading
         self._elapsed[simulator] = 0
         self._returns[simulator] = 0.0
 

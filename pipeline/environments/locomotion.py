@@ -175,6 +175,11 @@ class LocomotionBatch(MujocoBatch):
             np.minimum(np.maximum(velocities, -limit, out=velocities), limit, out=velocities)
         return states
 
+    def tells_state(self, observations: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return (N,) whether no velocity was clipped."""
+        velocities = np.abs(observations[:, self.model.nq :])
+        return np.asarray((velocities < self.task.velocity_limit).all(axis=1))
+
     def step(self, actions: NDArray[np.floating]) -> StepOutcome:
         """Apply (G, A) actions for one control step in every simulator."""
         x_before = self._qpos[:, 0].copy()
@@ -206,6 +211,10 @@ class LocomotionBatch(MujocoBatch):
         data.qpos[:] = self.task.init_qpos + rng.uniform(low=-scale, high=scale, size=self.model.nq)
         data.qvel[:] = self.task.reset_velocity(rng)
         mujoco.mj_forward(self.model, data)
+
+    def _put(self, data: mujoco.MjData, observation: Floats) -> None:
+        # A velocity that the observation has clipped is placed at the limit.
+        data.qpos[:], data.qvel[:] = np.split(observation, [self.model.nq])
 
     def _read(self, simulator: int) -> None:
         self._qpos[simulator] = self._positions[simulator]

@@ -15,7 +15,7 @@ import gymnasium
 import mujoco
 import numpy as np
 from gymnasium.utils.seeding import np_random
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from oodil.pipeline.environments.batch import MujocoBatch, StepOutcome
 
@@ -32,6 +32,8 @@ BOX_START, BOX_SIZE, BOX_MASS = (0.5, 0.0, 0.08), (0.3, 0.2, 0.2), 10.0
 BOX_FRICTION = 0.25
 GOAL_X, GOAL_Z, GOAL_RADIUS = 0.81, 0.05, 0.05
 START_BEFORE_X = 0.4
+PLACED_FROM, PLACED_WITHIN, PLACED_STEPS = 6, 1e-6, 300
+"""Starts from which the angles for an observed hand are sought, the error (m) that ends a search, and its steps."""
 SUCCESS_REWARD, FAILURE_REWARD = 1000.0, -1000.0
 SERVO = 1000.0
 """N m s / rad. The wanted velocity is the distance to the wanted angle, per second, so this is the stiffness, too."""
@@ -73,9 +75,40 @@ class Arm:
                 break
         data.ctrl[:] = data.qpos[self.angles]
 
-    def put_box(self, data: mujoco.MjData) -> None:
-        """Put the box where it starts."""
-        data.qpos[self._box : self._box + 7] = (*BOX_START, 1, 0, 0, 0)
+    def place(self, data: mujoco.MjData, hand: Floats, box: Floats) -> None:
+        """Put hand (3,) and box (3,) there, at rest and the box upright: neither turn nor velocity is observed.
+
+        Of the angles found from several starts, those count that bring the hand nearest and the arm least into things.
+        """
+        found: list[tuple[float, Floats]] = []
+        for seed in range(PLACED_FROM):
+            self.start(data, np.random.default_rng(seed))
+            self.put_box(data, box)
+            for _ in range(PLACED_STEPS):
+                mujoco.mj_kinematics(self.model, data)
+                error = hand - self.hand(data)
+                if np.linalg.norm(error) < PLACED_WITHIN:
+                    break
+                turned = data.qpos[self.angles] + 0.3 * self.toward(data, error)
+                data.qpos[self.angles] = np.clip(turned, self.low, self.high)
+            mujoco.mj_forward(self.model, data)
+            touched = self._is_arm[data.contact.geom].any(axis=1)
+            depth = np.max(-data.contact.dist[touched], initial=0.0)
+            found.append((float(np.linalg.norm(hand - self.hand(data)) + depth), data.qpos.copy()))
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[:] = min(found, key=lambda each: each[0])[1]
+        data.ctrl[:] = data.qpos[self.angles]
+        mujoco.mj_forward(self.model, data)
+
+    def toward(self, data: mujoco.MjData, velocity: Floats) -> Floats:
+        """Return (J,) turning that moves the hand with ``velocity`` (3,), by damped least squares."""
+        jacobian = self.jacobian(data)
+        return np.asarray(jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-3 * np.eye(3), velocity))
+
+    def put_box(self, data: mujoco.MjData, position: ArrayLike = BOX_START) -> None:
+        """Put the box somewhere, upright."""
+        data.qpos[self._box : self._box + 3] = position
+        data.qpos[self._box + 3 : self._box + 7] = (1, 0, 0, 0)
 
     def is_before_box(self, data: mujoco.MjData) -> bool:
         """Return whether an episode may start like this: the hand before the box, and the arm touching nothing."""
@@ -212,6 +245,10 @@ class PandaBatch(MujocoBatch):
         self._returns += rewards
         return StepOutcome(rewards, reached | lost, self._elapsed >= self.max_episode_steps)
 
+    def tells_state(self, observations: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return (N,) that none does: angles and velocities are not observed."""
+        return np.zeros(len(observations), np.bool_)
+
     def demonstrator(self) -> "Pusher":
         """Return the hand-written demonstrator of these arms."""
         return Pusher(self)
@@ -223,6 +260,9 @@ class PandaBatch(MujocoBatch):
 
     def _start(self, data: mujoco.MjData, seed: int) -> None:
         self.arm.start(data, np_random(seed)[0])
+
+    def _put(self, data: mujoco.MjData, observation: Floats) -> None:
+        self.arm.place(data, *np.split(observation, 2))
 
     def _read(self, simulator: int) -> None:
         data = self._data[simulator]

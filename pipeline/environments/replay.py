@@ -1,4 +1,4 @@
-"""Any deterministic Gymnasium environment, its inner state unknown: a snapshot is a seed and the actions since.
+"""Any deterministic Gymnasium environment, its inner state unknown: a snapshot is a start and the actions since.
 
 Restoring plays an episode again from its start. That is as slow as it sounds, so a batch that stands where it is asked
 to go does nothing; workers keep one batch per env group, and a group tends to stay with its worker.
@@ -29,6 +29,16 @@ def box_spaces(env: gymnasium.Env[Any, Any]) -> tuple[gymnasium.spaces.Box, gymn
     return seen, action
 
 
+def can_be_placed(env: gymnasium.Env[Any, Any]) -> bool:
+    """Return whether an environment has a method ``place(observation)``, which returns what it then observes."""
+    return hasattr(env.unwrapped, "place")
+
+
+def unplaceable(env_id: str) -> str:
+    """Say that an environment cannot be placed."""
+    return f"environment {env_id!r} cannot be put into an observed state: its class has no method place(observation)"
+
+
 class ReplayBatch:
     """G Gymnasium environments side by side; the caller decides when an ended one is reset.
 
@@ -45,8 +55,10 @@ class ReplayBatch:
         self.observation_dim = int(np.prod(seen.shape))
         self.action_dim = int(np.prod(action.shape))
         self._observations = np.zeros((self.num_simulators, self.observation_dim))
-        # A row is a seed and then every action since, as far as there are any.
-        self._history = np.zeros((self.num_simulators, 1 + max_episode_steps * self.action_dim))
+        # A row is a seed and then every action since, as far as there are any. One that can be placed has room in
+        # between for where it was placed; its seed is -1 then.
+        self._before_actions = 1 + self.observation_dim * can_be_placed(environments[0])
+        self._history = np.zeros((self.num_simulators, self._before_actions + max_episode_steps * self.action_dim))
         self._elapsed = np.zeros(self.num_simulators, np.int64)
         self._returns = np.zeros(self.num_simulators)
         self._terminated = np.zeros(self.num_simulators, np.bool_)
@@ -59,9 +71,31 @@ class ReplayBatch:
     def reset(self, simulator: int, seed: int) -> None:
         """Start a new episode in one environment with a seed of at most 2**53."""
         observation, _ = self._environments[simulator].reset(seed=seed)
+        self._begin(simulator, observation)
+        self._history[simulator, 0] = seed
+
+    def place(self, simulator: int, observation: NDArray[np.floating]) -> None:
+        """Start a new episode in one environment, put where (S,) is observed by its own method ``place``.
+
+        Raises UnusableEnvironmentError if it has none.
+        """
+        env = self._environments[simulator]
+        if not can_be_placed(env):
+            raise UnusableEnvironmentError(unplaceable(env.spec.id if env.spec is not None else str(env.unwrapped)))
+        env.reset(seed=0)  # Wrappers count an episode's steps from its reset.
+        task: Any = env.unwrapped
+        wanted = observation.astype(np.float64)
+        self._begin(simulator, task.place(wanted.reshape(env.observation_space.shape or ())))
+        self._history[simulator, 0] = -1
+        self._history[simulator, 1 : self._before_actions] = wanted
+
+    def tells_state(self, observations: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return (N,) that all do: an environment with a method ``place`` says so by having it."""
+        return np.ones(len(observations), np.bool_)
+
+    def _begin(self, simulator: int, observation: Any) -> None:
         self._observations[simulator] = np.asarray(observation, np.float64).ravel()
         self._history[simulator] = 0
-        self._history[simulator, 0] = seed
         self._elapsed[simulator] = 0
         self._returns[simulator] = 0.0
         self._terminated[simulator] = self._truncated[simulator] = False
@@ -94,13 +128,16 @@ class ReplayBatch:
         for i, (history, elapsed) in enumerate(zip(snapshot.states, snapshot.elapsed_steps.tolist(), strict=True)):
             if elapsed == self._elapsed[i] and history.tobytes() == self._history[i].tobytes():
                 continue
-            self.reset(i, seed=int(history[0]))
-            for action in history[1:].reshape(-1, self.action_dim)[:elapsed]:
+            if history[0] < 0:
+                self.place(i, history[1 : self._before_actions])
+            else:
+                self.reset(i, seed=int(history[0]))
+            for action in history[self._before_actions :].reshape(-1, self.action_dim)[:elapsed]:
                 self._advance(i, action.astype(np.float32))
 
     def _advance(self, simulator: int, action: NDArray[np.float32]) -> float:
         elapsed = int(self._elapsed[simulator])
-        begin = 1 + elapsed * self.action_dim
+        begin = self._before_actions + elapsed * self.action_dim
         self._history[simulator, begin : begin + self.action_dim] = action
         space = self._actions
         clipped = np.clip(action.reshape(space.shape), space.low, space.high).astype(space.dtype)

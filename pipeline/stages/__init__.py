@@ -9,7 +9,16 @@ import importlib
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.stage import Stage, registered, stage_named
-from oodil.pipeline.stages import clustering, demonstrations, experts, imitators, marks, policies, transferability
+from oodil.pipeline.stages import (
+    clustering,
+    demonstrations,
+    experts,
+    imitators,
+    marks,
+    policies,
+    reproducibility,
+    transferability,
+)
 from oodil.pipeline.stages.policies import PolicyStage
 from oodil.pipeline.stages.weighting import Weighting
 
@@ -23,6 +32,7 @@ __all__ = [
     "marks",
     "policies",
     "policies_of",
+    "reproducibility",
     "stages",
     "transferability",
     "weightings_of",
@@ -39,6 +49,8 @@ def stages(config: RunConfig) -> list[Stage]:
             add(needed)
         found.setdefault(name, stage)
 
+    if config.reproducibility is not None:
+        add("reproducibility")  # It takes a minute, so it comes before everything that takes longer.
     for entry in ("imitation", *config.baselines):
         module, _, name = entry.rpartition(":")
         if module:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         Evaluation,
         LearningCurve,
         Policy,
+        Reproducibility,
         Transferability,
     )
     from oodil.pipeline.runs import RunResults
@@ -45,6 +46,7 @@ __all__ = [
     "OodilError",
     "Policy",
     "PolicyStage",
+    "Reproducibility",
     "RunConfig",
     "RunResults",
     "Transferability",
@@ -75,6 +77,7 @@ _HOMES = {
         "Evaluation",
         "LearningCurve",
         "Policy",
+        "Reproducibility",
         "Transferability",
     ),
     "oodil.pipeline.runs": ("RunResults",),

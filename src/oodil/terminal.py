@@ -173,6 +173,10 @@ def _summary_rows(results: RunResults) -> Iterator[tuple[str, str]]:
             yield f"AUROC, {weighting.title}", f"{figures['auroc']:.3f}"
             shares = f"{figures['share_before']:.3f} -> {figures['share']:.3f}"
             yield f"transferable share of the sampling mass, {weighting.title}", shares
+    if "reproducibility" in found:
+        sources = found["reproducibility"]["reproducible"]
+        everything = "everything" if found["reproducibility"]["everything"] else ", ".join(sources) or "nothing"
+        yield "the imitator's simulator can follow", everything
     if "env_steps" in found:
         yield "environment steps", f"{found['env_steps']:,}"
     if "seconds" in found:

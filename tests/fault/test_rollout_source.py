@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import oodil.pipeline.collecting
@@ -153,6 +154,19 @@ def test_workers_give_the_same_bits_as_no_workers(
     try:
         assert_same_bits(chain(source, 4), chain(InlineRollouts(), 4))
         assert source.dropped == {}
+    finally:
+        workers.close()
+
+
+def test_workers_begin_episodes_where_they_are_to(
+    source: ZmqRollouts, endpoint: str, assert_same_bits: SameBits
+) -> None:
+    starts = np.array([[0, 1.25, *[0] * 9, 0.125], [1, 1.25, *[0] * 10]], np.float32)
+    units = [replace(unit, starts=starts) for unit in hopper_units(0, num_steps=60)]
+    workers = Threads(endpoint, 2)
+    try:
+        source.submit(units)
+        assert_same_bits(source.gather(), inline(units))
     finally:
         workers.close()
 

@@ -26,6 +26,32 @@ SOURCES = {
 }
 
 
+@settings(max_examples=25)
+@given(st.floats(-1, 1), st.floats(-1, 1), st.floats(0, 6.28), st.floats(-1, 1))
+def test_a_placed_car_goes_on_as_the_original(east: float, north: float, heading: float, steering: float) -> None:
+    """To the precision of the observation, 32 bits; the other cars of the batch do not notice."""
+    batch, other, third = (make_batch(ID, {}, 2) for _ in range(3))
+    for g in range(2):
+        other.reset(g, g)
+    untouched = other.snapshot()
+    seen = np.array([east, north, np.cos(heading), np.sin(heading), heading], np.float32)
+    batch.place(0, seen)
+    np.testing.assert_allclose(batch.observations()[0], seen, atol=1e-6)
+    batch.step(np.full((2, 1), steering))
+    other.step(np.zeros((2, 1)))
+    other.restore(untouched)
+    other.place(0, batch.observations()[0].astype(np.float32))
+    snapshot = other.snapshot()
+    assert snapshot.elapsed_steps[0] == snapshot.episode_returns[0] == 0
+    assert snapshot.states[1].tobytes() == untouched.states[1].tobytes()
+    third.restore(snapshot)
+    for cars in (batch, other, third):
+        cars.step(np.full((2, 1), -steering))
+    apart = np.abs(other.observations()[0] - batch.observations()[0])
+    assert np.minimum(apart, np.abs(apart - 2 * np.pi)).max() < 1e-6
+    assert third.observations().tobytes() == other.observations().tobytes()
+
+
 @pytest.mark.slow
 @settings(max_examples=25)
 @given(SHARES, SHARES, st.floats(0.5, 8.0), st.integers(0, 2**31 - 1))

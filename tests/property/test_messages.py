@@ -68,7 +68,7 @@ def policies(draw: st.DrawFn) -> GaussianPolicy:
 @st.composite
 def unit_messages(draw: st.DrawFn) -> UnitMessage:
     """Draw a unit."""
-    group = draw(sizes)
+    group, policy = draw(sizes), draw(policies())
     unit = Unit(
         iteration=draw(counts),
         group=draw(counts),
@@ -77,9 +77,10 @@ def unit_messages(draw: st.DrawFn) -> UnitMessage:
         num_simulators=draw(counts),
         num_steps=draw(counts),
         policy_version=draw(counts),
-        policy=draw(policies()),
+        policy=policy,
         key=tuple(draw(st.lists(counts, max_size=5))),
         snapshot=draw(st.none() | snapshots(group)),
+        starts=draw(st.none() | array(np.float32, draw(sizes), len(policy.input_mean))),
     )
     return UnitMessage(draw(headers), unit)
 

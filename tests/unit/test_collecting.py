@@ -13,6 +13,7 @@ from oodil.pipeline.collecting import collect
 from oodil.pipeline.data import Unit
 from oodil.pipeline.environments import make_batch
 from oodil.pipeline.seeding import derive_key, numpy_rng
+from oodil.workers.messages import Header, UnitMessage, decode, encode
 
 HOPPER, CHEETAH = "oodil/Hopper-v0", "oodil/HalfCheetah-v0"
 
@@ -136,6 +137,30 @@ def test_episodes_continue_or_start_anew(unit):
     upright = np.array([0, 1.25, *[0] * 10])
     assert (np.abs(following[ended[:-1]] - upright) <= 0.005 + 1e-6).all()
     assert (np.abs(successors[ended[:-1]] - upright).max(axis=1) > 0.05).all()
+
+
+def test_episodes_begin_at_the_starts_that_are_given(unit, assert_same_bits):
+    """Each of them, in other orders under other keys; a unit that is sent on changes nothing."""
+    rng = np.random.default_rng(0)
+    starts = (np.array([0, 1.25, *[0] * 10]) + 0.01 * rng.standard_normal((3, 12))).astype(np.float32)
+    given = replace(unit, starts=starts)
+    result = collect(given)
+    assert_same_bits(collect(given), result)
+    (sent,) = [decode(encode(UnitMessage(Header("run", "learner", "me", 0), given)))]
+    assert_same_bits(collect(sent.unit), result)
+    rollout = result.rollout
+    ended = rollout.terminated | rollout.truncated
+    begun = np.concatenate((rollout.observations[0], rollout.observations[1:][ended[:-1]]))
+    which = (begun[:, None] == starts).all(axis=2)
+    assert (which.sum(axis=1) == 1).all() and which.any(axis=0).all()
+    assert collect(replace(given, key=(1,))).rollout.observations[0].tobytes() != rollout.observations[0].tobytes()
+    assert rollout.episode_lengths.max() <= 60
+
+
+def test_a_unit_goes_on_from_its_snapshot_whatever_the_starts(unit):
+    unit = following(unit, collect(unit))
+    starts = np.tile(np.array([0, 1.25, *[0] * 10], np.float32), (1, 1))
+    assert (collect(replace(unit, starts=starts)).rollout.observations[0] != starts).any()
 
 
 def test_log_probabilities_are_those_of_the_actions(unit, network):

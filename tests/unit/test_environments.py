@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from oodil.pipeline.environments import make_batch
+from oodil.pipeline.environments import environment_spec, make_batch
 from oodil.pipeline.errors import OodilError
 
 HOPPER, WALKER, CHEETAH = "oodil/Hopper-v0", "oodil/Walker2d-v0", "oodil/HalfCheetah-v0"
@@ -198,6 +198,78 @@ def test_a_simulator_does_not_depend_on_its_neighbors():
         two.step(action)
     assert one.observations()[1].tobytes() == two.observations()[1].tobytes()
     assert one.observations()[0].tobytes() != two.observations()[0].tobytes()
+
+
+def placed_beside(batch, other, steps):
+    """Move along with random actions and place the first simulator's observation in the other batch before each.
+
+    Returns (steps, 2) how far one step from there is from one step of the original, and whether no velocity is clipped.
+    """
+    rng, seen = np.random.default_rng(0), []
+    for t in range(steps):
+        observation = batch.observations()[0].astype(np.float32)
+        other.place(0, observation)
+        assert (other.observations()[0] == observation).all()
+        told = batch.tells_state(batch.observations())[0]
+        actions = np.repeat(rng.uniform(-0.5, 0.5, (1, batch.action_dim)), 2, axis=0)
+        outcome = batch.step(actions)
+        other.step(actions)
+        seen.append((np.abs(batch.observations()[0] - other.observations()[0]).max(), told))
+        if outcome.terminated[0]:
+            batch.reset(0, seed=t)
+    return np.array(seen)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "dynamics", "tolerance"),
+    [(HOPPER, {"gravity": 12.0}, 3e-5), (WALKER, {"friction": 19.9}, 3e-5), (CHEETAH, {"back": 0.9}, 3e-4)],
+)
+def test_a_placed_robot_goes_on_as_the_original(env_id, dynamics, tolerance):
+    """To the precision of the observation, 32 bits, wherever no velocity is clipped."""
+    batch, other = make_batch(env_id, dynamics, 2), make_batch(env_id, dynamics, 2)
+    batch.reset(0, seed=0)
+    errors, told = placed_beside(batch, other, 300).T
+    errors = errors[told == 1]
+    assert len(errors) > 100
+    assert np.median(errors) < 3e-6 and errors.max() < tolerance
+
+
+def test_clipped_velocities_do_not_tell_the_state():
+    batch = make_batch(WALKER, {}, 1)
+    seen = np.zeros((3, 18))
+    seen[0, 9:], seen[1, 12], seen[2, :9] = 9.9, -10.0, 50.0
+    assert batch.tells_state(seen).tolist() == [True, False, True]
+    assert make_batch(CHEETAH, {}, 1).tells_state(seen).all()
+
+
+def test_placing_starts_an_episode_and_leaves_the_others_alone(assert_same_bits):
+    """Nothing of what was before matters, the solver's warm start included."""
+    batch, fresh = make_batch(WALKER, FOREVER, 3), make_batch(WALKER, FOREVER, 3)
+    actions = random_actions(batch)
+    for g in range(3):
+        batch.reset(g, seed=g)
+        fresh.reset(g, seed=g + 9)
+    for t in range(100):
+        batch.step(actions(t))
+    before, observation = batch.snapshot(), batch.observations()[0].astype(np.float32)
+    batch.place(1, observation)
+    fresh.place(1, observation)
+    after = batch.snapshot()
+    for name in ("states", "elapsed_steps", "episode_returns"):
+        assert_same_bits(getattr(after, name)[[0, 2]], getattr(before, name)[[0, 2]])
+        assert_same_bits(getattr(after, name)[1], getattr(fresh.snapshot(), name)[1])
+    assert (after.elapsed_steps[1], after.episode_returns[1]) == (0, 0)
+    other = make_batch(WALKER, FOREVER, 3)
+    other.restore(after)
+    for t in range(50):
+        action = actions(t)
+        assert_same_bits(batch.step(action), other.step(action))
+        assert_same_bits(batch.observations(), other.observations())
+
+
+@pytest.mark.parametrize(("env_id", "placeable"), [(HOPPER, True), ("oodil/Driving-v0", True), ("Pendulum-v1", False)])
+def test_whether_an_environment_can_be_placed_is_known_before(env_id, placeable):
+    assert environment_spec(env_id, {}).can_be_placed == placeable
 
 
 @pytest.mark.parametrize("gravity", [1.0, 9.81, 15.0])

@@ -84,6 +84,35 @@ def test_a_snapshot_continues_to_the_same_bits(assert_same_bits) -> None:
     assert_same_bits(batch.snapshot(), other.snapshot())
 
 
+@pytest.mark.parametrize("locked", [(), (1, 3), (1, 3, 4)], ids=str)
+def test_a_placed_arm_has_hand_and_box_where_they_were(locked: tuple[int, ...], assert_same_bits) -> None:
+    """Within 1 mm; after a step within 15 mm, since it starts at rest."""
+    batch, other, third = (make_batch(SLOW_ID, dynamics(locked), 2) for _ in range(3))
+    pusher = hand_written(batch, SLOW_ID)
+    for g in range(2):
+        batch.reset(g, g)
+        other.reset(g, g)
+    untouched = other.snapshot()
+    for t in range(60):
+        seen = batch.observations()
+        actions = pusher.mean(seen)
+        batch.step(actions)
+        if t % 12:
+            continue
+        other.place(0, seen[0].astype(np.float32))
+        np.testing.assert_allclose(other.observations()[0], seen[0], atol=1e-3)
+        after = other.snapshot()
+        assert after.elapsed_steps[0] == after.episode_returns[0] == 0
+        assert_same_bits(after.states[1], untouched.states[1])
+        third.restore(after)
+        other.step(actions)
+        third.step(actions)
+        assert_same_bits(other.snapshot(), third.snapshot())
+        np.testing.assert_allclose(other.observations()[0], batch.observations()[0], atol=0.015)
+        other.restore(untouched)
+    assert not batch.tells_state(batch.observations()).any()
+
+
 def relative_turn(arm: Arm, data: mujoco.MjData, number: int) -> np.ndarray:
     """Return the rotation of a joint's link against the link before."""
     child = arm.model.body(f"robot0_link{number}")

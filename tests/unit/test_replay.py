@@ -117,6 +117,55 @@ def test_what_cannot_be_repeated_or_never_ends_is_refused() -> None:
     assert check_environment(PENDULUM, {"g": 5.0}).observation_shape == (3,)
 
 
+class Ball(gymnasium.Env[np.ndarray, np.ndarray]):
+    """A ball on a line that is pushed, and that can be placed."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2, 1), np.float64)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        return self.place(self.np_random.uniform(-1, 1, (2, 1))), {}
+
+    def place(self, observation: np.ndarray) -> np.ndarray:
+        assert observation.shape == (2, 1)
+        self.state = observation.copy()
+        return self.state.copy()
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.state = self.state + 0.1 * np.array([self.state[1], action])
+        return self.state.copy(), 1.0, bool(self.state[0] > 2), False, {}
+
+
+def test_an_environment_with_a_method_for_it_can_be_placed(assert_same_bits: Any) -> None:
+    gymnasium.register("test/Ball-v0", entry_point=Ball, max_episode_steps=50)
+    assert check_environment("test/Ball-v0", {}).can_be_placed
+    batch, other = make_batch("test/Ball-v0", {}, COUNT), make_batch("test/Ball-v0", {}, COUNT)
+    for g in range(COUNT):
+        batch.reset(g, seed=g)
+    actions = actions_of(batch, 60)
+    for action in actions[:49]:
+        batch.step(action)
+    before = batch.snapshot()
+    batch.place(1, np.array([0.5, -0.25], np.float32))
+    assert batch.observations()[1].tolist() == [0.5, -0.25]
+    assert_same_bits(batch.snapshot().states[[0, 2]], before.states[[0, 2]])
+    assert batch.elapsed_steps().tolist() == [49, 0, 49] and batch.episode_returns().tolist() == [49, 0, 49]
+    for _ in range(2):
+        other.restore(batch.snapshot())
+        assert_same_bits(other.snapshot(), batch.snapshot())
+        for action in actions[49:54]:
+            assert_same_bits(other.step(action), batch.step(action))
+            assert other.observations().tobytes() == batch.observations().tobytes()
+    assert batch.elapsed_steps().tolist() == [50, 10, 50]
+
+
+def test_an_environment_without_one_is_refused() -> None:
+    with pytest.raises(OodilError, match=r"^environment 'Pendulum-v1' cannot be put into an observed state: .*place"):
+        make_batch(PENDULUM, {}, 1).place(0, np.zeros(3))
+    assert not check_environment(PENDULUM, {}).can_be_placed
+
+
 def test_a_snapshot_of_another_size_is_refused() -> None:
     small, large = make_batch(PENDULUM, {}, 1), make_batch(PENDULUM, {}, 2)
     with pytest.raises(ValueError, match=r"histories of shape \(1, 201\); this batch needs \(2, 201\)"):

@@ -4,13 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from oodil.pipeline.algorithms.gail import imitator
 from oodil.pipeline.algorithms.learner import EnvReward, Learner
 from oodil.pipeline.artifacts import Checkpoints
 from oodil.pipeline.collecting import InlineRollouts
 from oodil.pipeline.config import EnvironmentConfig, GailConfig, PpoConfig, TrainingConfig, TrpoConfig, ValueConfig
-from oodil.pipeline.training import train
+from oodil.pipeline.training import experience, train
 
 
 class Context:
@@ -46,6 +47,19 @@ def test_a_training_that_diverges_names_the_figure_and_leaves_no_checkpoint_of_i
         train(learner, EnvironmentConfig(), config, [], Context(), checkpoints)
     arrays, _ = checkpoints.load()
     assert arrays is None or all((value == value).all() for value in arrays.values())
+
+
+def test_episodes_begin_where_they_are_to(tmp_path: Path) -> None:
+    config = TrainingConfig(total_steps=200, num_groups=2, simulators_per_group=2, steps_per_rollout=25)
+    start = np.array([[0, 1.25, *[0] * 9, 0.125]], np.float32)
+    learner, context = Learner(12, 3, config, EnvReward(), root_seed=0), Context()
+    seen: list[NDArray] = []
+    submit = context.rollouts.submit
+    context.rollouts.submit = lambda units: (seen.extend(u.starts for u in units), submit(units))[1]
+    train(learner, EnvironmentConfig(), config, [], context, Checkpoints(tmp_path, {}), starts=start)
+    assert len(seen) == 4 and all(each is start for each in seen)
+    batch = experience(learner.behavior_policy(), EnvironmentConfig(), config, 25, 0, Context(), starts=start)
+    assert (batch.observations[0] == start[0]).all()
 
 
 ALWAYS = {"reward", "policy_lag", "kl", "entropy", "value_loss", "return", "length"}
