@@ -58,15 +58,16 @@ class Task:
 
 TASKS = {
     "hopper": Task(
-        "oodil/Hopper-v0", "hopper-gravity-9.8", {"gravity": 9.8}, {"gravity": 12.0}, {"gravity": 11.0}, 10, 2900, 700_000
+        "oodil/Hopper-v0", "hopper-gravity-9.8", {"gravity": 9.8},
+        {"gravity": 12.0}, {"gravity": 11.0}, 10, 2900, 700_000,
     ),
     "walker2d": Task(
-        "oodil/Walker2d-v0", "walker2d-friction-9.9", {"friction": 9.9}, {"friction": 19.9}, {"friction": 15.0}, 50, 2000,
-        1_000_000,
+        "oodil/Walker2d-v0", "walker2d-friction-9.9", {"friction": 9.9},
+        {"friction": 19.9}, {"friction": 15.0}, 50, 2000, 1_000_000,
     ),
     "half_cheetah": Task(
-        "oodil/HalfCheetah-v0", "half-cheetah-back-0.9", {"front": 1.0, "back": 0.9}, {},
-        {"front": 0.95, "back": 0.95}, 100, 3000, 1_500_000,
+        "oodil/HalfCheetah-v0", "half-cheetah-back-0.9", {"front": 1.0, "back": 0.9},
+        {}, {"front": 0.95, "back": 0.95}, 100, 3000, 1_500_000,
     ),
     "driving": Task(
         "oodil/Driving-v0", "hand-written", {"obstacle_1": 0.5, "obstacle_2": 0.25, "speed": 1.0},
@@ -74,8 +75,8 @@ TASKS = {
         50, 0, 1_000_000, -500,
     ),
     "panda": Task(
-        "oodil/Panda20Hz-v0", "hand-written", {"joint_1": 0}, {"joint_1": 0, "joint_3": 0}, {"joint_1": 0, "joint_5": 0},
-        140, 500, 500_000, 500,
+        "oodil/Panda20Hz-v0", "hand-written", {"joint_1": 0},
+        {"joint_1": 0, "joint_3": 0}, {"joint_1": 0, "joint_5": 0}, 140, 500, 500_000, 500,
     ),
 }  # fmt: skip
 

@@ -108,7 +108,7 @@ class TrainingConfig(_Section):
     """Steps of each simulator per iteration."""
     lag: Literal[0, 1] = 1
     """Policy versions between collection and update; 1 lets workers collect while the learner updates."""
-    discount: UnitInterval = 0.995
+    discount: float = Field(default=0.995, ge=0.0, lt=1.0)
     """Discount per step."""
     gae_lambda: UnitInterval = 0.97
     """Decay of generalized advantage estimation."""

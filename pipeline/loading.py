@@ -89,6 +89,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 def apply_override(values: dict[str, Any], override: str) -> None:
+    """Set the field that ``a.b.0=VALUE`` names. Raises ConfigError where there is no such place."""
     key, equals, text = override.partition("=")
     if not equals or not key:
         raise ConfigError(f"override {override!r} is not of the form key=value")

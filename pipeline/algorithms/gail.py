@@ -34,6 +34,8 @@ DISTANCE_TRANSITIONS = 10_000
 class AdversarialReward:
     """The reward model of GAIL: a discriminator that rewards transitions like those of the weighted demonstrations."""
 
+    ends_persist = True
+
     def __init__(
         self,
         demonstrations: Demonstrations,
@@ -67,10 +69,6 @@ class AdversarialReward:
         """Return (T, G) rewards; `Learner` asks for them before the discriminator's step of the same iteration."""
         logits = self.discriminator(self._inputs_of(batch))
         rewards = imitation_reward(logits, self.discriminator.config.reward).numpy().reshape(batch.terminated.shape)
-        import os
-
-        if os.environ.get("PERSIST"):
-            rewards = np.where(batch.terminated, rewards * 200, rewards)
         return rewards
 
     def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:

@@ -28,6 +28,10 @@ from oodil.pipeline.seeding import derive_key, torch_seed
 class RewardModel(Protocol):
     """Where an iteration's rewards come from."""
 
+    ends_persist: bool
+    """Whether an episode that has ended earns its last reward for ever. A positive reward would otherwise pay for
+    putting off an end that the demonstrations reach, and a negative one for a fall."""
+
     def state_standardization(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Return (S,) mean and scale to normalize states by; None lets the learner estimate them."""
 
@@ -46,6 +50,8 @@ class RewardModel(Protocol):
 
 class EnvReward:
     """The environment's own reward, for training experts only."""
+
+    ends_persist = False
 
     def state_standardization(self) -> None:
         """Return None: the states are not known before training."""
@@ -114,6 +120,8 @@ class Learner(Generic[Reward]):
         rng = torch.Generator().manual_seed(torch_seed(derive_key(self.root_seed, "learner", iteration)))
         # Scaled by 1 - discount, values are averages of rewards, and so of order one for every horizon.
         rewards = self.reward_model.rewards(batch) * np.float32(self._reward_scale)
+        if self.reward_model.ends_persist:
+            rewards[batch.terminated] /= 1 - config.discount
         observations = torch.from_numpy(batch.observations).flatten(0, 1)
         inputs = self.policy.normalize(observations)
         values, next_values = self._values(inputs, batch)
