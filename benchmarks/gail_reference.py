@@ -103,7 +103,9 @@ def run_seed(name: str, dynamics: str, seed: int, config: GailConfig, keep: Path
     target: dict[str, float] = getattr(task, dynamics)
     demonstrations = demonstrations_of(task, seed)
     spec, weights = environment_spec(task.env_id, target), np.ones(len(demonstrations))
-    learner = imitator(spec.observation_dim, spec.action_dim, demonstrations, weights, config, seed)
+    learner = imitator(
+        spec.observation_dim, spec.action_dim, spec.max_episode_steps, demonstrations, weights, config, seed
+    )
     key = derive_key(seed, "benchmark")
     measuring = 0.0
     started = time.perf_counter()

@@ -41,7 +41,7 @@ def learner_for(env_id: str) -> Learner[AdversarialReward]:
     gail = run_config(env_id, 1).imitation.gail
     demonstrations = random_demonstrations(env_id)
     spec, weights = environment_spec(env_id, {}), np.ones(len(demonstrations))
-    return imitator(spec.observation_dim, spec.action_dim, demonstrations, weights, gail, 0)
+    return imitator(spec.observation_dim, spec.action_dim, spec.max_episode_steps, demonstrations, weights, gail, 0)
 
 
 def real_costs(env_id: str) -> tuple[dict[str, float], Unit, UnitResult]:

@@ -34,7 +34,15 @@ def train_job(run_dir: Path, name: str) -> dict[str, NDArray]:
     environment, gail = config.environment, section.gail
     cluster, spec = ClusterJob.of(run, name), environment_spec(environment.id, environment.dynamics)
     weights = np.ones(len(cluster.members))
-    learner = imitator(spec.observation_dim, spec.action_dim, cluster.demonstrations, weights, gail, cluster.seed)
+    learner = imitator(
+        spec.observation_dim,
+        spec.action_dim,
+        spec.max_episode_steps,
+        cluster.demonstrations,
+        weights,
+        gail,
+        cluster.seed,
+    )
 
     def settled() -> NDArray[np.float64]:
         reward = cluster.reward(config, learner.reward_model.discriminator_arrays())

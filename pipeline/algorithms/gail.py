@@ -34,16 +34,17 @@ DISTANCE_TRANSITIONS = 10_000
 class AdversarialReward:
     """The reward model of GAIL: a discriminator that rewards transitions like those of the weighted demonstrations."""
 
-    ends_persist = True
-
     def __init__(
         self,
         demonstrations: Demonstrations,
         weights: NDArray[np.float64],
         config: DiscriminatorConfig,
+        max_episode_steps: int,
         root_seed: int,
     ) -> None:
         """Prepare to draw pairs in proportion to ``weights`` (N,), one per demonstration (Eqn 7).
+
+        A demonstration with fewer than ``max_episode_steps`` transitions has reached an end.
 
         Raises ValueError unless the weights are finite, not negative and not all zero.
         """
@@ -56,6 +57,7 @@ class AdversarialReward:
         self._cumulative = np.cumsum(np.repeat(weights, demonstrations.lengths - 1))
         self._state_weights = np.repeat(weights, demonstrations.lengths)
         self._observations = demonstrations.observations
+        self.ended_share = float(np.average(demonstrations.lengths - 1 < max_episode_steps, weights=weights))
         seed = torch_seed(derive_key(root_seed, "discriminator", "initial"))
         self.discriminator = Discriminator(demonstrations, weights, config, seed)
         self._policy_inputs: tuple[TransitionBatch, Tensor] | None = None
@@ -148,6 +150,7 @@ class AdversarialReward:
 def imitator(
     observation_dim: int,
     action_dim: int,
+    max_episode_steps: int,
     demonstrations: Demonstrations,
     weights: NDArray[np.float64],
     config: GailConfig,
@@ -163,5 +166,5 @@ def imitator(
             f"demonstrations have states with {demonstrations.observation_dim} dimensions; the imitator's have "
             f"{observation_dim}"
         )
-    reward = AdversarialReward(demonstrations, weights, config.discriminator, seed)
+    reward = AdversarialReward(demonstrations, weights, config.discriminator, max_episode_steps, seed)
     return Learner(observation_dim, action_dim, config, reward, seed)

@@ -28,9 +28,9 @@ from oodil.pipeline.seeding import derive_key, torch_seed
 class RewardModel(Protocol):
     """Where an iteration's rewards come from."""
 
-    ends_persist: bool
-    """Whether an episode that has ended earns its last reward for ever. A positive reward would otherwise pay for
-    putting off an end that the demonstrations reach, and a negative one for a fall."""
+    ended_share: float
+    """Share of an endless last reward that the end of an episode is worth: that of the demonstrations that end, too. A
+    positive reward pays for going on, which is right where none of them ends, and puts off a goal that they reach."""
 
     def state_standardization(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Return (S,) mean and scale to normalize states by; None lets the learner estimate them."""
@@ -51,7 +51,7 @@ class RewardModel(Protocol):
 class EnvReward:
     """The environment's own reward, for training experts only."""
 
-    ends_persist = False
+    ended_share = 0.0
 
     def state_standardization(self) -> None:
         """Return None: the states are not known before training."""
@@ -120,8 +120,7 @@ class Learner(Generic[Reward]):
         rng = torch.Generator().manual_seed(torch_seed(derive_key(self.root_seed, "learner", iteration)))
         # Scaled by 1 - discount, values are averages of rewards, and so of order one for every horizon.
         rewards = self.reward_model.rewards(batch) * np.float32(self._reward_scale)
-        if self.reward_model.ends_persist:
-            rewards[batch.terminated] /= 1 - config.discount
+        rewards[batch.terminated] *= 1 + self.reward_model.ended_share * config.discount / (1 - config.discount)
         observations = torch.from_numpy(batch.observations).flatten(0, 1)
         inputs = self.policy.normalize(observations)
         values, next_values = self._values(inputs, batch)

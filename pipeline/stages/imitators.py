@@ -44,7 +44,7 @@ class ClusterJob:
 
         weights = np.ones(len(self.members))
         section = config.transferability.gail.discriminator
-        reward = AdversarialReward(self.demonstrations, weights, section, self.seed)
+        reward = AdversarialReward(self.demonstrations, weights, section, 1, self.seed)
         reward.load_discriminator(discriminator)
         return reward
 
@@ -80,7 +80,15 @@ class ImitatorsStage(Stage):
         cluster = ClusterJob.of(run, job)
         spec = environment_spec(config.environment.id, config.environment.dynamics)
         weights = np.ones(len(cluster.members))  # All demonstrations of a cluster weigh the same.
-        learner = imitator(spec.observation_dim, spec.action_dim, cluster.demonstrations, weights, gail, cluster.seed)
+        learner = imitator(
+            spec.observation_dim,
+            spec.action_dim,
+            spec.max_episode_steps,
+            cluster.demonstrations,
+            weights,
+            gail,
+            cluster.seed,
+        )
         reward = learner.reward_model
         probe = Probe("logits", config.evaluation.num_scores, lambda: reward.mean_logits(cluster.demonstrations))
         seen = train(learner, config.environment, gail, [probe], context, self.checkpoints(run, job))

@@ -86,7 +86,9 @@ class PolicyStage(Stage):
         # The same seeds for all policies: they differ in their weights alone.
         seed = torch_seed(derive_key(config.seed, "imitation", job))
         demonstrations, weights = load_demonstrations(run), self.weights(run)
-        learner = imitator(spec.observation_dim, spec.action_dim, demonstrations, weights, gail, seed)
+        learner = imitator(
+            spec.observation_dim, spec.action_dim, spec.max_episode_steps, demonstrations, weights, gail, seed
+        )
 
         def curve_point() -> NDArray[np.float64]:
             policy, key = learner.behavior_policy(), derive_key(config.seed, "curve")

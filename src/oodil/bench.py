@@ -85,7 +85,7 @@ class LearnerLoop(Stage):
         demonstrations = random_demonstrations(environment.id)
         weights = np.linspace(0.1, 1.0, len(demonstrations))
         simulators = make_batch(environment.id, environment.dynamics, 1)
-        reward = AdversarialReward(demonstrations, weights, gail.discriminator, 0)
+        reward = AdversarialReward(demonstrations, weights, gail.discriminator, simulators.max_episode_steps, 0)
         learner = Learner(simulators.observation_dim, simulators.action_dim, gail, reward, 0)
         train(learner, environment, gail, [], context, self.checkpoints(run, job))
         return {}

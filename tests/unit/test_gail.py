@@ -209,8 +209,8 @@ def test_a_settled_discriminator_tells_a_policy_that_no_longer_learns(demonstrat
 
 def test_an_imitator_is_a_learner_with_an_adversarial_reward(demonstrations, rollout, assert_same_bits):
     shown, weights, config = demonstrations(20, 20), np.array([1.0, 0.5]), GailConfig(total_steps=100)
-    one = imitator(3, 2, shown, weights, config, seed=7)
-    two = Learner(3, 2, config, AdversarialReward(shown, weights, config.discriminator, 7), 7)
+    one = imitator(3, 2, 9, shown, weights, config, seed=7)
+    two = Learner(3, 2, config, AdversarialReward(shown, weights, config.discriminator, 9, 7), 7)
     for learner in (one, two):
         learner.update(batch_of(rollout(0)), 0)
     assert_same_bits(one.state_dict(), two.state_dict())
@@ -219,4 +219,4 @@ def test_an_imitator_is_a_learner_with_an_adversarial_reward(demonstrations, rol
 
 def test_an_imitator_needs_demonstrations_of_its_own_states(demonstrations):
     with pytest.raises(DataError, match="states with 3 dimensions; the imitator's have 12"):
-        imitator(12, 3, demonstrations(5), np.ones(1), GailConfig(total_steps=100), seed=0)
+        imitator(12, 3, 9, demonstrations(5), np.ones(1), GailConfig(total_steps=100), seed=0)

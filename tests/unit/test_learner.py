@@ -32,7 +32,7 @@ def build(demonstrations=None, **settings):
         **settings,
     )
     weights = np.array([1.0, 0.3])
-    reward = AdversarialReward(demonstrations, weights, config.discriminator, 0) if demonstrations else EnvReward()
+    reward = AdversarialReward(demonstrations, weights, config.discriminator, 9, 0) if demonstrations else EnvReward()
     return Learner(12, 3, config, reward, root_seed=0)
 
 
@@ -215,7 +215,7 @@ def test_an_expert_improves_the_policy_that_collected(policy_optimizer, monkeypa
 
 def test_imitators_are_normalized_by_the_demonstrations_as_they_are_weighted(demonstrations):
     both = demonstrations(4, 2)
-    reward = AdversarialReward(both, np.array([1.0, 3.0]), DiscriminatorConfig(hidden=(8,)), 0)
+    reward = AdversarialReward(both, np.array([1.0, 3.0]), DiscriminatorConfig(hidden=(8,)), 9, 0)
     learner = Learner(3, 2, TrainingConfig(total_steps=100, policy_hidden=(8,)), reward, 0)
     repeated = np.concatenate([both[0], both[1], both[1], both[1]]).astype(np.float64)
     np.testing.assert_allclose(learner.policy.input_mean.numpy(), repeated.mean(axis=0), rtol=1e-5)

@@ -88,7 +88,7 @@ def test_what_a_training_reports(tmp_path: Path, demonstrations, kind, imitate, 
         policy_optimizer=TrpoConfig() if kind == "trpo" else PpoConfig(),
     )
     shown = demonstrations(30, observation_dim=12)
-    learner = imitator(12, 3, shown, np.ones(1), config, 0) if imitate else Learner(12, 3, config, EnvReward(), 0)
+    learner = imitator(12, 3, 9, shown, np.ones(1), config, 0) if imitate else Learner(12, 3, config, EnvReward(), 0)
     context = Context()
     train(learner, EnvironmentConfig(), config, [], context, Checkpoints(tmp_path, {}))
     expected = ALWAYS | (TRPO if kind == "trpo" else set()) | (DISCRIMINATOR if imitate else set())
