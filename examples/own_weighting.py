@@ -35,7 +35,8 @@ class Pace(oodil.Weighting):
         states = (demonstrations[n] for n in range(len(demonstrations)))
         pace = np.array([max(0.0, float(each[-1, 0] - each[0, 0])) / (len(each) - 1) for each in states])
         scores = pace / pace.max()
-        return oodil.Transferability(scores, scores / scores.sum(), np.full(len(scores), -1, np.int32))
+        no_clusters, exact = np.full(len(scores), -1, np.int32), np.stack((scores, scores), axis=1)
+        return oodil.Transferability(scores, scores / scores.sum(), no_clusters, intervals=exact, threshold=0.5)
 
 
 oodil.register(Pace())

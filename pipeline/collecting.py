@@ -9,6 +9,7 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oodil.pipeline.data import Rollout, Unit, UnitResult
 from oodil.pipeline.environments import Simulators, make_batch
@@ -51,6 +52,14 @@ def _simulators(unit: Unit) -> Simulators:
     return groups[unit.group]
 
 
+def begin(simulators: Simulators, simulator: int, rng: np.random.Generator, starts: NDArray[np.float32] | None) -> None:
+    """Start a new episode in one simulator, as the environment does or in one of the (P, S) ``starts``."""
+    if starts is None:
+        simulators.reset(simulator, seed=int(rng.integers(2**31)))
+    else:
+        simulators.place(simulator, starts[rng.integers(len(starts))])
+
+
 def collect(unit: Unit) -> UnitResult:
     """Run one env group for ``num_steps`` steps; the result depends on nothing but ``unit``."""
     simulators = _simulators(unit)
@@ -58,15 +67,9 @@ def collect(unit: Unit) -> UnitResult:
     shape = (unit.num_steps, unit.num_simulators)
     noise = rng.standard_normal((*shape, simulators.action_dim), dtype=np.float32)
 
-    def begin(simulator: int) -> None:
-        if unit.starts is None:
-            simulators.reset(simulator, seed=int(rng.integers(2**31)))
-        else:
-            simulators.place(simulator, unit.starts[rng.integers(len(unit.starts))])
-
     if unit.snapshot is None:
         for g in range(unit.num_simulators):
-            begin(g)
+            begin(simulators, g, rng, unit.starts)
     else:
         simulators.restore(unit.snapshot)
 
@@ -93,7 +96,7 @@ def collect(unit: Unit) -> UnitResult:
             returns.extend(simulators.episode_returns()[ended].tolist())
             lengths.extend(simulators.elapsed_steps()[ended].tolist())
             for g in ended.tolist():
-                begin(g)
+                begin(simulators, g, rng, unit.starts)
             current = simulators.observations()
 
     rollout = Rollout(

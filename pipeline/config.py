@@ -90,9 +90,6 @@ class DiscriminatorConfig(_Section):
     are, the paper's."""
     gradient_penalty: float = Field(default=1.0, ge=0.0)
     """Weight of half the squared gradient of its logit at demonstrations."""
-    reward: Literal["positive", "logit"] = "positive"
-    """-log(1 - D), which also pays for going on; or log D - log(1 - D), which is negative away from the demonstrations
-    and may pay for ending."""
 
 
 class TrainingConfig(_Section):
@@ -124,7 +121,8 @@ class TrainingConfig(_Section):
     initial_log_std: float = 0.0
     """Logarithm of the policy's initial standard deviation."""
     final_std: PositiveFloat | None = None
-    """What the policy's standard deviation shrinks to in the second half of the training; null leaves it alone."""
+    """What the policy's standard deviation shrinks to in the second half of the training, and never falls below, so
+    that mean actions do what sampled ones learned; null leaves it alone."""
     policy_optimizer: Annotated[TrpoConfig | PpoConfig, Field(discriminator="kind")] = TrpoConfig()
     """How the policy is improved."""
     value: ValueConfig = ValueConfig()
@@ -154,6 +152,7 @@ class TrainingConfig(_Section):
 class GailConfig(TrainingConfig):
     """Adversarial imitation: training whose reward comes from a discriminator."""
 
+    final_std: PositiveFloat | None = 0.1
     discriminator: DiscriminatorConfig = DiscriminatorConfig()
     """What tells demonstrations from the policy."""
 
@@ -299,13 +298,13 @@ class TransferabilityConfig(_Section):
     gail: GailConfig
     """Training of each job. ``anneal`` is off unless it is set: a discriminator that stops learning is fooled in the
     end, and the scores of what cannot be reproduced rise."""
-    final_steps: PositiveInt = 200
-    """Steps that the discriminator takes against the finished imitator, which no longer learns, before it is read."""
+    reading: ReadingConfig = ReadingConfig()
+    """How the finished imitators are read."""
     num_trainings: PositiveInt = 1
     """Trainings of each cluster's imitator, each with a seed of its own; the one whose transitions come closest to the
     cluster's counts."""
-    sharpening: float = Field(default=4.0, gt=0.0)
-    """Power to which a transferability is raised to become a weight; 1 is the paper's form (docs/decisions.md)."""
+    kept_from: UnitInterval = 0.5
+    """A demonstration is kept if its score is at least this share of the best cluster's."""
 
     @model_validator(mode="before")
     @classmethod
@@ -347,7 +346,7 @@ class EvaluationConfig(_Section):
     """Episodes per point of the curve."""
     final_episodes: PositiveInt = 32
     """Episodes of the final evaluation; `oodil evaluate` runs more of a finished policy."""
-    num_scores: int = Field(default=100, ge=2)
+    num_scores: int = Field(default=20, ge=2)
     """Times the demonstrations of a cluster are scored while its imitator is trained, for the report."""
 
 

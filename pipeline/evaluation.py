@@ -5,31 +5,46 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from oodil.pipeline.collecting import begin
+from oodil.pipeline.config import EnvironmentConfig
 from oodil.pipeline.data import Episode
 from oodil.pipeline.environments import Simulators, make_batch
 from oodil.pipeline.errors import UnusableEnvironmentError
 from oodil.pipeline.policy import Controller, GaussianPolicy
 from oodil.pipeline.results import Evaluation, Policy
-from oodil.pipeline.seeding import Key, numpy_rng
+from oodil.pipeline.seeding import Key, derive_key, numpy_rng
 
+if TYPE_CHECKING:
+    from oodil.pipeline.algorithms.gail import AdversarialReward
+
+DISTANCE_EPISODES = 16
+"""Mean-action episodes that a policy's distance to demonstrations is measured with."""
 FRAMES_PER_SECOND = 30
 """Of a video, about; the environments run at 10 to 240 steps per second of simulated time."""
 
 
 def run_episodes(
-    simulators: Simulators, controller: Controller, rng: np.random.Generator, *, stochastic: bool
+    simulators: Simulators,
+    controller: Controller,
+    rng: np.random.Generator,
+    *,
+    stochastic: bool,
+    starts: NDArray[np.float32] | None = None,
 ) -> list[Episode]:
-    """Run one fresh episode in every simulator side by side; only a Gaussian policy can be ``stochastic``."""
+    """Run one fresh episode in every simulator side by side; only a Gaussian policy can be ``stochastic``.
+
+    An episode begins as the environment has it begin, or in one of the (P, S) ``starts``.
+    """
     count = simulators.num_simulators
     for g in range(count):
-        simulators.reset(g, seed=int(rng.integers(2**31)))
+        begin(simulators, g, rng, starts)
     trace = [simulators.observations().astype(np.float32)]
     returns, lengths, terminated = np.zeros(count), np.zeros(count, np.int64), np.zeros(count, np.bool_)
     while not lengths.all():
@@ -59,6 +74,19 @@ def evaluate(
     """Run ``episodes`` fresh episodes, with mean actions unless ``stochastic``."""
     seen = run_episodes(make_batch(env_id, dynamics, episodes), policy, numpy_rng(key), stochastic=stochastic)
     return Evaluation(np.array([e.env_return for e in seen]), np.array([len(e.states) - 1 for e in seen]))
+
+
+def distance_of(
+    policy: GaussianPolicy,
+    reward: "AdversarialReward",
+    environment: EnvironmentConfig,
+    seed: int,
+    starts: NDArray[np.float32] | None = None,
+) -> float:
+    """Return how far fresh episodes of mean actions are from the demonstrations that a reward model was made for."""
+    simulators = make_batch(environment.id, environment.dynamics, DISTANCE_EPISODES)
+    rng = numpy_rng(derive_key(seed, "distance"))
+    return reward.distance(run_episodes(simulators, policy, rng, stochastic=False, starts=starts))
 
 
 def film(policy: Policy, env_id: str, dynamics: Mapping[str, float], seed: int, path: Path) -> float:

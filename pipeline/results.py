@@ -24,7 +24,8 @@ _SCORES, _HISTORY, _SUMMARY = "transferability.safetensors", "history.safetensor
 _POLICY, _POLICY_META, _DISCRIMINATOR = "policy.safetensors", "policy.json", "discriminator.safetensors"
 _CURVE, _EVALUATION = "curve.json", "evaluation.json"
 _IMITATORS, _JOB_SCORES, _TRAININGS = "imitators.json", "scores.safetensors", "trainings.json"
-_RESIDUALS = "residuals.safetensors"
+_RESIDUALS, _DISTANCE = "residuals.safetensors", "distance.json"
+_DIVERGENCES, _READING, _READERS = "divergences.safetensors", "reading.json", "readers.safetensors"
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -197,7 +198,7 @@ class Reproducibility:
 
 @dataclass(frozen=True)
 class ScoreHistory:
-    """The mean logits of a cluster's demonstrations while its imitator was trained, and when it was read."""
+    """The mean logits of a cluster's demonstrations while its imitator was trained."""
 
     demonstrations: NDArray[np.int64]
     """(N_k,) which of all demonstrations they are."""
@@ -215,11 +216,6 @@ class ScoreHistory:
         """Read an artifact."""
         return cls(**_arrays(artifact, _JOB_SCORES, cls))
 
-    def then(self, env_steps: int, logits: NDArray[np.float64]) -> "ScoreHistory":
-        """Return this history with one more reading, after ``env_steps`` more."""
-        steps = np.append(self.env_steps, self.env_steps[-1] + env_steps)
-        return ScoreHistory(self.demonstrations, steps, np.concatenate((self.logits, logits[None])))
-
 
 @dataclass(frozen=True)
 class Imitator:
@@ -228,15 +224,48 @@ class Imitator:
     policy: GaussianPolicy
     discriminator: Arrays
     """Its parameters by name."""
+    distance: float
+    """Of mean-action episodes to the demonstrations, see `AdversarialReward.distance`."""
 
     def files(self) -> Files:
         """Return the artifact's content."""
-        return {_POLICY: encode_arrays(self.policy.arrays())} | discriminator_file(self.discriminator)
+        described = {_DISTANCE: encode_json({"distance": self.distance})}
+        return {_POLICY: encode_arrays(self.policy.arrays())} | discriminator_file(self.discriminator) | described
 
     @classmethod
     def load(cls, artifact: Artifact) -> Self:
         """Read an artifact."""
-        return cls(_policy(artifact), load_discriminator(artifact))
+        return cls(_policy(artifact), load_discriminator(artifact), artifact.json(_DISTANCE)["distance"])
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What an imitator reproduces of the demonstrations of its cluster, before it is turned into scores."""
+
+    demonstrations: NDArray[np.int64]
+    """(N_k,) which of all demonstrations they are."""
+    divergences: NDArray[np.float64]
+    """(R, N_k) nats per transition, see `Readers.train`."""
+    env_steps: int
+    """Environment steps that the reading took."""
+    readers: Arrays
+    """What reads other demonstrations (`Readers.arrays`)."""
+
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        arrays: Arrays = {"demonstrations": self.demonstrations, "divergences": self.divergences}
+        described = {"env_steps": self.env_steps}
+        return {
+            _DIVERGENCES: encode_arrays(arrays),
+            _READING: encode_json(described),
+            _READERS: encode_arrays(self.readers),
+        }
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        arrays: dict[str, Any] = artifact.arrays(_DIVERGENCES) | artifact.json(_READING)
+        return cls(**arrays, readers=artifact.arrays(_READERS))
 
 
 @dataclass(frozen=True)
@@ -268,40 +297,58 @@ class Transferability:
     """(N,) not negative, summing to one."""
     clusters: NDArray[np.int32]
     """(N,) cluster ids; -1 for a weighting without clusters."""
+    intervals: NDArray[np.float64]
+    """(N, 2) in which the scores lie."""
+    threshold: float
+    """From which score a demonstration is kept."""
     env_steps: int = 0
     """Environment steps that the weighting took."""
     history: dict[int, ScoreHistory] = field(default_factory=dict)
-    """By cluster, for a weighting that reads jobs; the last reading is the one that counts."""
+    """By cluster, for a weighting that trains imitators: how its demonstrations were told from them meanwhile."""
+
+    @property
+    def verdicts(self) -> NDArray[np.str_]:
+        """(N,) ``kept`` if the whole interval reaches the threshold, ``not kept`` if none of it does, else ``open``."""
+        low, high = self.intervals.T
+        return np.where(low >= self.threshold, "kept", np.where(high < self.threshold, "not kept", "open"))
 
     def files(self) -> Files:
         """Return the artifact's content."""
-        arrays: Arrays = {"scores": self.scores, "weights": self.weights, "clusters": self.clusters}
+        arrays = {name: getattr(self, name) for name in ("scores", "weights", "clusters", "intervals")}
         history: Arrays = {
             f"cluster_{k}/{name}": array for k, seen in self.history.items() for name, array in vars(seen).items()
         }
         return {
             _SCORES: encode_arrays(arrays),
             _HISTORY: encode_arrays(history),
-            _SUMMARY: encode_json({"env_steps": self.env_steps}),
+            _SUMMARY: encode_json({"threshold": self.threshold, "env_steps": self.env_steps}),
         }
 
     @classmethod
     def load(cls, artifact: Artifact) -> Self:
         """Read an artifact."""
-        arrays = artifact.arrays(_SCORES)
         named: dict[int, Arrays] = {}
         for key, array in artifact.arrays(_HISTORY).items():
             cluster, _, name = key.removeprefix("cluster_").partition("/")
             named.setdefault(int(cluster), {})[name] = array
         history = {k: ScoreHistory(**named[k]) for k in sorted(named)}
-        return cls(**arrays, env_steps=artifact.json(_SUMMARY)["env_steps"], history=history)
+        arrays: dict[str, Any] = artifact.arrays(_SCORES) | artifact.json(_SUMMARY)
+        return cls(**arrays, history=history)
 
     def columns(self) -> Arrays:
         """Return (N,) arrays by the names that tables and exported files use."""
-        return {"cluster": self.clusters, "transferability": self.scores, "weight": self.weights}
+        low, high = self.intervals.T
+        return {
+            "cluster": self.clusters,
+            "transferability": self.scores,
+            "low": low,
+            "high": high,
+            "verdict": self.verdicts,
+            "weight": self.weights,
+        }
 
     def table(self) -> list[dict[str, Any]]:
-        """Return one row a demonstration: its number, cluster, transferability and weight."""
+        """Return one row a demonstration: its number, cluster, transferability with interval, verdict and weight."""
         columns = self.columns()
         return [
             {"demonstration": n, **{name: column[n].item() for name, column in columns.items()}}

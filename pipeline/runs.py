@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oodil.pipeline.algorithms.weights import sampling_mass, sharpened_weights
+from oodil.pipeline.algorithms.weights import effective_number, sampling_mass
 from oodil.pipeline.artifacts import Artifact
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
@@ -29,6 +29,9 @@ from oodil.pipeline.results import (
 from oodil.pipeline.stage import Run, StageState, state_of
 from oodil.pipeline.stages import PolicyStage, Weighting, policies_of, stages, weightings_of
 from oodil.pipeline.stages.demonstrations import load_demonstrations, transferable_marks
+
+POWERS = 1, 2, 4, 8
+"""Of the scores, for comparison: what weights would have been without a rule of what is kept."""
 
 
 class RunResults:
@@ -157,7 +160,8 @@ class RunResults:
         """Return how well a weighting tells what is marked transferable from what is marked not to be.
 
         ``auroc`` of the scores, and the former's share of the sampling mass: ``share_before`` weighting, ``share`` with
-        the weights and ``share_unsharpened`` with the scores as weights. Empty without marks of both kinds.
+        the weights, and ``share_power_1``, 2, 4 and 8 with that power of the scores instead; ``effective_number`` of
+        those that are marked transferable. Empty without marks of both kinds.
         """
         marks, found = self.marks(), self.weighting(weighting)
         if marks is None or not 0 < marks.sum() < len(marks):
@@ -259,13 +263,12 @@ def separation_metrics(
     """Return what `RunResults.separation` does for (N,) marks of both kinds, scores and weights."""
     from sklearn.metrics import roc_auc_score
 
-    by_share = {
-        "share_before": np.ones(len(demonstrations)),
-        "share_unsharpened": sharpened_weights(scores, 1.0),
-        "share": weights,
-    }
+    by_share = {"share_before": np.ones(len(demonstrations)), "share": weights}
+    by_share |= {f"share_power_{power}": scores**power + 1e-300 for power in POWERS}
     shares = {name: float(sampling_mass(w, demonstrations)[marks].sum()) for name, w in by_share.items()}
-    return {"auroc": float(roc_auc_score(marks, scores)), **shares}
+    auroc = float(roc_auc_score(marks, scores))
+    kept = weights[marks]
+    return {"auroc": auroc, **shares, "effective_number": effective_number(kept) if kept.any() else 0.0}
 
 
 def shown_return(value: float) -> str:

@@ -6,8 +6,6 @@ comes from a demonstration, label 1 is the demonstration and 0 the policy. The p
 Letters: N demonstrations, B batch, M demonstration pairs, S observation.
 """
 
-from typing import Literal
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -29,13 +27,12 @@ def discriminator_losses(demonstration_logits: Tensor, policy_logits: Tensor) ->
     return softplus(-demonstration_logits).mean(), softplus(policy_logits).mean()
 
 
-def imitation_reward(logits_expert_is_high: Tensor, kind: Literal["positive", "logit"]) -> Tensor:
-    """Return (B,) rewards, large where a pair looks like a demonstration.
+def imitation_reward(logits_expert_is_high: Tensor) -> Tensor:
+    """Return (B,) rewards -log(1 - D), large where a pair looks like a demonstration.
 
-    ``positive`` is -log(1 - D), the reward of GAIL, which also rewards survival; see docs/algorithms.md. ``logit`` is
-    log D - log(1 - D), the logit itself, the reward of AIRL (Fu et al. 2018, https://arxiv.org/abs/1710.11248).
+    They are positive, and so pay for going on; what an end is worth is the learner's affair (`RewardModel`).
     """
-    return softplus(logits_expert_is_high) if kind == "positive" else logits_expert_is_high
+    return softplus(logits_expert_is_high)
 
 
 class Discriminator(nn.Module):

@@ -70,7 +70,7 @@ class AdversarialReward:
     def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
         """Return (T, G) rewards; `Learner` asks for them before the discriminator's step of the same iteration."""
         logits = self.discriminator(self._inputs_of(batch))
-        rewards = imitation_reward(logits, self.discriminator.config.reward).numpy().reshape(batch.terminated.shape)
+        rewards = imitation_reward(logits).numpy().reshape(batch.terminated.shape)
         return rewards
 
     def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:

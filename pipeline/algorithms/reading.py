@@ -4,7 +4,7 @@ The discriminator of a training cannot say it: it has seen every demonstration o
 policy. So fresh ones are trained against the finished imitator, each on half of the demonstrations and half of the
 imitator's episodes, and read the other halves.
 
-Letters: N demonstrations, E episodes, R repetitions, B batch.
+Letters: N demonstrations, E episodes, R repetitions, D discriminators (two in each repetition), B batch.
 """
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from oodil.pipeline.algorithms.discriminator import Discriminator
+from oodil.pipeline.artifacts import below, nested
 from oodil.pipeline.config import DiscriminatorConfig, ReadingConfig
 from oodil.pipeline.data import Demonstrations, offsets_of
 from oodil.pipeline.seeding import derive_key, numpy_rng, torch_seed
@@ -20,39 +21,62 @@ from oodil.pipeline.seeding import derive_key, numpy_rng, torch_seed
 Array = NDArray[np.float64]
 
 
-def divergences(
-    demonstrations: Demonstrations,
-    episodes: Demonstrations,
-    discriminator: DiscriminatorConfig,
-    reading: ReadingConfig,
-    seed: int,
-) -> Array:
-    """Return (R, N): how far each demonstration is from an imitator's episodes, in nats per transition.
+class Readers:
+    """Discriminators between demonstrations and an imitator's episodes, each trained on half of both."""
 
-    It is the mean logit over the demonstration less that over episodes, both held out; for a discriminator that has
-    learned the ratio of densities that is the symmetric Kullback-Leibler divergence, and 0 where they are the same. Each
-    repetition draws other halves. A single demonstration has no halves: the discriminator that reads it has seen it.
-    """
-    weights = np.ones(len(demonstrations))
+    def __init__(
+        self, demonstrations: Demonstrations, config: DiscriminatorConfig, repetitions: int, seed: int
+    ) -> None:
+        """Draw the untrained discriminators of demonstrations that all count the same."""
+        self._demonstrations = demonstrations
+        self._seed = seed
+        weights = np.ones(len(demonstrations))
+        seeds = [torch_seed(derive_key(seed, "reading", "initial", d)) for d in range(2 * repetitions)]
+        self._nets = [Discriminator(demonstrations, weights, config, each) for each in seeds]
+        self._references = np.zeros(len(self._nets))
+        """(D,) mean logit of each over the episodes that it has not seen."""
 
-    def fresh(*name: int | str) -> Discriminator:
-        return Discriminator(demonstrations, weights, discriminator, torch_seed(derive_key(seed, "reading", *name)))
+    def train(self, episodes: Demonstrations, config: ReadingConfig) -> Array:
+        """Train all of them, and return the (R, N) divergences of the demonstrations, none read by one that saw it.
 
-    view = fresh("view")
-    shown, played = _Transitions(demonstrations, view), _Transitions(episodes, view)
-    found = np.empty((reading.repetitions, len(demonstrations)))
-    for r in range(reading.repetitions):
-        rng = numpy_rng(derive_key(seed, "reading", r))
-        half_shown, half_played = shown.half(rng), played.half(rng)
-        for side in (True, False):
-            net = fresh(r, int(side))
-            ours, theirs = shown.rows(half_shown == side), played.rows(half_played == side)
-            for _ in range(reading.steps):
-                net.update(shown.draw(ours, reading.batch_size, rng), played.draw(theirs, reading.batch_size, rng))
-            reference = played.mean_logits(net)[half_played != side].mean()
-            read = half_shown != side if len(demonstrations) > 1 else np.array([True])
-            found[r, read] = shown.mean_logits(net)[read] - reference
-    return found
+        A single demonstration has no halves, and is read by those that have seen it.
+        """
+        shown, played = self._transitions(self._demonstrations), self._transitions(episodes)
+        found = np.empty((len(self._nets) // 2, len(self._demonstrations)))
+        for d, net in enumerate(self._nets):
+            r, side = divmod(d, 2)
+            halves = numpy_rng(derive_key(self._seed, "reading", "halves", r))
+            half_shown, half_played = (each.half(halves) == bool(side) for each in (shown, played))
+            rng = numpy_rng(derive_key(self._seed, "reading", "batches", d))
+            ours, theirs = shown.rows(half_shown), played.rows(half_played)
+            for _ in range(config.steps):
+                net.update(shown.draw(ours, config.batch_size, rng), played.draw(theirs, config.batch_size, rng))
+            self._references[d] = played.mean_logits(net)[~half_played].mean()
+            unseen = ~half_shown if len(half_shown) > 1 else np.array([True])
+            found[r, unseen] = shown.mean_logits(net)[unseen] - self._references[d]
+        return found
+
+    def divergences(self, demonstrations: Demonstrations) -> Array:
+        """Return (D, N) divergences of demonstrations that none of them was trained on."""
+        transitions = self._transitions(demonstrations)
+        logits = np.stack([transitions.mean_logits(net) for net in self._nets])
+        return np.asarray(logits - self._references[:, None])
+
+    def arrays(self) -> dict[str, NDArray]:
+        """Return everything that `divergences` needs; `load` is the inverse."""
+        arrays: dict[str, NDArray] = {"references": self._references}
+        for d, net in enumerate(self._nets):
+            arrays |= nested(str(d), {name: value.numpy() for name, value in net.state_dict().items()})
+        return arrays
+
+    def load(self, arrays: dict[str, NDArray]) -> None:
+        """Take over trained discriminators."""
+        self._references = arrays["references"]
+        for d, net in enumerate(self._nets):
+            net.load_state_dict({name: torch.from_numpy(value) for name, value in below(str(d), arrays).items()})
+
+    def _transitions(self, demonstrations: Demonstrations) -> "_Transitions":
+        return _Transitions(demonstrations, self._nets[0])
 
 
 class _Transitions:
@@ -65,12 +89,12 @@ class _Transitions:
         self._counts = demonstrations.lengths - 1
 
     def half(self, rng: np.random.Generator) -> NDArray[np.bool_]:
-        """Return (N,) whether each belongs to a random half; of one alone, both halves are the whole."""
+        """Return (N,) whether each belongs to a random half."""
         count = len(self._counts)
         return rng.permutation(count) < count // 2
 
     def rows(self, chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """Return the transitions of the (N,) chosen ones; of all where none is chosen."""
+        """Return the transitions of the (N,) chosen ones; of all if none is chosen, which is so with one alone."""
         return np.flatnonzero(np.repeat(chosen if chosen.any() else ~chosen, self._counts))
 
     def draw(self, rows: NDArray[np.intp], count: int, rng: np.random.Generator) -> Tensor:

@@ -1,6 +1,6 @@
-"""From logits to transferability to weights: the paper's Eqn (6) and (7).
+"""From what discriminators say to transferability to weights: the paper's Eqn (6) and (7).
 
-Letters: N demonstrations, E scores taken while a job ran and at its end.
+Letters: N demonstrations, R readings.
 """
 
 import numpy as np
@@ -11,12 +11,14 @@ from oodil.pipeline.data import Demonstrations
 Array = NDArray[np.float64]
 
 
-def transferability_of_logits(mean_logits: Array) -> Array:
-    """Return sigmoid(-mean logit): 0.5 where the imitator cannot be told from the demonstration, 0 where it fails.
+def transferability_of_divergences(divergences: Array) -> Array:
+    """Return 2 (1 - D) in [0, 1], where D tells a demonstration from the imitator's own fresh episodes.
 
-    ``mean_logits`` is (N,) or (E, N), of logits that are high for demonstrations; the paper's D is one minus ours.
+    1: it cannot be told from them; 0: nothing of it is reproduced. D = sigmoid(divergence / 2) is Eqn (6) with a logit
+    that is as high over the demonstration as it is low over the episodes, which no discriminator that is biased to
+    either side, by their numbers or by settling, can change.
     """
-    return np.exp(-np.logaddexp(0, mean_logits))
+    return np.minimum(1, 2 * np.exp(-np.logaddexp(0, divergences / 2)))
 
 
 def share_lasted(demonstrations: Demonstrations, horizon: int) -> Array:
@@ -29,13 +31,25 @@ def share_lasted(demonstrations: Demonstrations, horizon: int) -> Array:
     return np.where(demonstrations.terminated, lasted, 1.0)
 
 
-def sharpened_weights(scores: Array, sharpening: float) -> Array:
-    """Return (N,) weights that sum to one, proportional to score ** sharpening; uniform when every score is zero."""
-    largest = scores.max()
-    if largest <= 0:
-        return np.full(len(scores), 1 / len(scores))
-    weights = (scores / largest) ** sharpening
-    return np.asarray(weights / weights.sum())
+def kept_weights(readings: Array, threshold: float) -> Array:
+    """Return (N,) weights that sum to one: the mean score, times the share of readings that reach the threshold.
+
+    ``readings`` are (R, N) scores. Weights are uniform when no reading reaches it.
+    """
+    weights = readings.mean(axis=0) * (readings >= threshold).mean(axis=0)
+    return np.asarray(weights / weights.sum()) if weights.sum() > 0 else np.full(len(weights), 1 / len(weights))
+
+
+def intervals(readings: Array) -> Array:
+    """Return (N, 2) intervals of (R, N) scores: two standard deviations around the mean; [0, 1] with one reading."""
+    spread = 2 * readings.std(axis=0, ddof=1) if len(readings) > 1 else np.ones(readings.shape[1])
+    middle = readings.mean(axis=0)
+    return np.clip(np.stack((middle - spread, middle + spread), axis=1), 0, 1)
+
+
+def effective_number(weights: Array) -> float:
+    """Return how many demonstrations of equal weight would be as even: (sum w)^2 / sum w^2 of (N,) weights."""
+    return float(weights.sum() ** 2 / np.square(weights).sum())
 
 
 def sampling_mass(weights: Array, demonstrations: Demonstrations) -> Array:

@@ -25,9 +25,8 @@ from sklearn.decomposition import PCA
 from sklearn.manifold import TSNE
 from threadpoolctl import threadpool_limits
 
-from oodil.pipeline.algorithms.weights import transferability_of_logits
 from oodil.pipeline.report.formats import count
-from oodil.pipeline.results import Evaluation, LearningCurve, ScoreHistory
+from oodil.pipeline.results import Evaluation, LearningCurve, Transferability
 
 INK, MUTED, GRID = "#1c2430", "#687181", "#e6e9ee"
 
@@ -250,12 +249,16 @@ def _columns(
         axes.hlines(mine.mean(), i - 0.42, i + 0.42, color=INK, linewidth=1.6, zorder=4)
 
 
-def convergence(histories: dict[int, ScoreHistory], colors: dict[int, str]) -> Markup:
-    """Draw the scores of each cluster over environment steps in a panel: their mean and 10 to 90 % band."""
-    curves = {k: transferability_of_logits(history.logits) for k, history in histories.items()}
+def convergence(found: Transferability, colors: dict[int, str]) -> Markup:
+    """Draw each cluster in a panel: 2 (1 - D) of its training's discriminator, and as a mark what was read at the end.
+
+    The line is the mean over the cluster's demonstrations, the band and the bar are from the 10 to the 90 % quantile.
+    """
+    histories = found.history
+    curves = {k: np.minimum(1, 2 * np.exp(-np.logaddexp(0, seen.logits))) for k, seen in histories.items()}
     columns = min(len(histories), 5)
     rows = -(-len(histories) // columns)
-    highest = max(float(scores.max()) for scores in curves.values())
+    highest = max(float(found.scores.max()), *(float(scores.max()) for scores in curves.values()))
     with _drawing("convergence", 11, 0.75 + 1.75 * rows) as (figure, svg):
         panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False, gridspec_kw={"wspace": 0.07})
         for axes in panels.flat[len(histories) :]:
@@ -267,6 +270,10 @@ def convergence(histories: dict[int, ScoreHistory], colors: dict[int, str]) -> M
             low, high = np.quantile(scores, (0.1, 0.9), axis=1)
             axes.fill_between(env_steps, low, high, color=colors[k], alpha=0.22, linewidth=0)
             axes.plot(env_steps, scores.mean(axis=1), color=colors[k], linewidth=1.8)
+            read = found.scores[histories[k].demonstrations]
+            low, high = np.quantile(read, (0.1, 0.9))
+            axes.vlines(env_steps[-1], low, high, color=INK, linewidth=1.2)
+            axes.plot(env_steps[-1], read.mean(), marker="D", markersize=5, color=INK, clip_on=False)
             axes.set_title(f"cluster {k}", fontweight="bold")
             axes.set_title(f"N = {scores.shape[1]}", loc="right", fontsize=7.5, color=MUTED)
             _score_axis(axes, highest, note=False)

@@ -231,7 +231,7 @@ def _weighting(found: Findings, sources: Sources, name: str) -> WeightingSection
         title=found.title(name),
         rule=found.rule(name),
         figure=figures.transferability(weighting.scores, sources.index, sources.looks),
-        convergence=figures.convergence(weighting.history, colors) if weighting.history else None,
+        convergence=figures.convergence(weighting, colors) if weighting.history else None,
     )
 
 

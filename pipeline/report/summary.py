@@ -128,7 +128,7 @@ def cards(found: Findings) -> list[Card]:
         )
     for name, figures in found.separation.items():
         of = f", {found.title(name)}" if len(found.separation) > 1 else ""
-        share, unsharpened = formats.percent(figures["share"]), formats.percent(figures["share_unsharpened"])
+        share, unsharpened = formats.percent(figures["share"]), formats.percent(figures["share_power_1"])
         note = "of the transitions that a policy learns from, before and after weighting"
         if unsharpened != share:
             note += f" ({unsharpened} with scores as weights)"

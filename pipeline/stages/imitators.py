@@ -12,14 +12,17 @@ from numpy.typing import NDArray
 from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.environments import environment_spec
-from oodil.pipeline.results import Arrays, Assignment, Imitator, ScoreHistory, TrainedImitators
+from oodil.pipeline.environments import environment_spec, make_batch
+from oodil.pipeline.evaluation import distance_of
+from oodil.pipeline.results import Assignment, Imitator, ScoreHistory, TrainedImitators
 from oodil.pipeline.seeding import derive_key, torch_seed
 from oodil.pipeline.stage import JobContext, Run, Stage, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 
 if TYPE_CHECKING:
     from oodil.pipeline.algorithms.gail import AdversarialReward
+    from oodil.pipeline.algorithms.learner import Learner
+    from oodil.pipeline.algorithms.reading import Readers
 
 
 @dataclass(frozen=True)
@@ -38,22 +41,39 @@ class ClusterJob:
         seed = torch_seed(derive_key(run.config.seed, "transferability", job))
         return cls(members, load_demonstrations(run).select(members), seed)
 
-    def reward(self, config: RunConfig, discriminator: Arrays) -> "AdversarialReward":
-        """Return the reward model of a trained discriminator."""
-        from oodil.pipeline.algorithms.gail import AdversarialReward
+    def starts(self, config: RunConfig) -> NDArray[np.float32] | None:
+        """Return the (P, S) states from which its imitator begins: where the demonstrations do, if it can be put there.
 
-        weights = np.ones(len(self.members))
-        section = config.transferability.gail.discriminator
-        reward = AdversarialReward(self.demonstrations, weights, section, 1, self.seed)
-        reward.load_discriminator(discriminator)
-        return reward
+        Where a demonstration begins is part of what is seen; an imitator that begins elsewhere could be told by that.
+        """
+        environment = config.environment
+        if not environment_spec(environment.id, environment.dynamics).can_be_placed:
+            return None
+        first = self.demonstrations.observations[self.demonstrations.offsets[:-1]]
+        told = make_batch(environment.id, environment.dynamics, 1).tells_state(first)
+        return first[told] if told.any() else None
+
+    def learner(self, config: RunConfig) -> "Learner[AdversarialReward]":
+        """Return the untrained learner of its imitator; all demonstrations of a cluster weigh the same."""
+        from oodil.pipeline.algorithms.gail import imitator
+
+        spec = environment_spec(config.environment.id, config.environment.dynamics)
+        dims = spec.observation_dim, spec.action_dim, spec.max_episode_steps
+        return imitator(*dims, self.demonstrations, np.ones(len(self.members)), config.transferability.gail, self.seed)
+
+    def readers(self, config: RunConfig) -> "Readers":
+        """Return untrained discriminators that are to read the demonstrations."""
+        from oodil.pipeline.algorithms.reading import Readers
+
+        section = config.transferability
+        return Readers(self.demonstrations, section.gail.discriminator, section.reading.repetitions, self.seed)
 
 
 class ImitatorsStage(Stage):
     """A job per cluster and training, each with its own checkpoint and artifact; empty clusters have none."""
 
     name = "imitators"
-    version = 1
+    version = 2
     inputs = ("demonstrations", "clustering")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
@@ -73,27 +93,19 @@ class ImitatorsStage(Stage):
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Imitate one cluster, and note what the discriminator says of its demonstrations along the way."""
-        from oodil.pipeline.algorithms.gail import imitator
         from oodil.pipeline.training import Probe, train
 
         config, gail = run.config, run.config.transferability.gail
         cluster = ClusterJob.of(run, job)
-        spec = environment_spec(config.environment.id, config.environment.dynamics)
-        weights = np.ones(len(cluster.members))  # All demonstrations of a cluster weigh the same.
-        learner = imitator(
-            spec.observation_dim,
-            spec.action_dim,
-            spec.max_episode_steps,
-            cluster.demonstrations,
-            weights,
-            gail,
-            cluster.seed,
-        )
+        learner = cluster.learner(config)
         reward = learner.reward_model
         probe = Probe("logits", config.evaluation.num_scores, lambda: reward.mean_logits(cluster.demonstrations))
-        seen = train(learner, config.environment, gail, [probe], context, self.checkpoints(run, job))
+        starts, checkpoints = cluster.starts(config), self.checkpoints(run, job)
+        seen = train(learner, config.environment, gail, [probe], context, checkpoints, starts=starts)
         history = ScoreHistory(cluster.members.astype(np.int64), seen.steps("logits"), seen.values("logits"))
-        trained = Imitator(learner.behavior_policy(), reward.discriminator_arrays())
+        policy = learner.behavior_policy()
+        distance = distance_of(policy, reward, config.environment, cluster.seed, starts)
+        trained = Imitator(policy, reward.discriminator_arrays(), distance)
         return trained.files() | history.files()
 
     def combine(self, run: Run) -> Files:

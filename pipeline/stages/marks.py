@@ -19,7 +19,7 @@ class MarksWeighting(Weighting):
 
     name = "marks"
     title = "marks"
-    version = 1
+    version = 2
     inputs = ("demonstrations",)
 
     def check(self, config: RunConfig) -> None:
@@ -36,7 +36,9 @@ class MarksWeighting(Weighting):
         demonstrations = load_demonstrations(run)
         marks = np.array([float(mark is True) for mark in transferable_marks(run.config)])
         scores = marks[demonstrations.sources]
-        return Transferability(scores, scores / scores.sum(), np.full(len(scores), -1, np.int32)).files()
+        intervals = np.stack((scores, scores), axis=1)
+        clusters = np.full(len(scores), -1, np.int32)
+        return Transferability(scores, scores / scores.sum(), clusters, intervals, threshold=0.5).files()
 
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
         """Raise CannotScoreError: the marks are of the run's own sources."""

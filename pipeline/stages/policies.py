@@ -1,26 +1,19 @@
 """Stage 5: a policy, by GAIL on weighted demonstrations (Eqn 7 and 8); policies differ in their weightings alone."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodil.pipeline.artifacts import Files
-from oodil.pipeline.config import EnvironmentConfig, RunConfig
-from oodil.pipeline.environments import environment_spec, make_batch
-from oodil.pipeline.evaluation import evaluate, run_episodes
-from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.environments import environment_spec
+from oodil.pipeline.evaluation import distance_of, evaluate
 from oodil.pipeline.results import LearningCurve, Policy, Training, Trainings, discriminator_file
-from oodil.pipeline.seeding import derive_key, numpy_rng, torch_seed
+from oodil.pipeline.seeding import derive_key, torch_seed
 from oodil.pipeline.stage import JobContext, Run, Stage, register, stage_named
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 from oodil.pipeline.stages.weighting import Weighting
-
-if TYPE_CHECKING:
-    from oodil.pipeline.algorithms.gail import AdversarialReward
-
-DISTANCE_EPISODES = 16
-"""Mean-action episodes that a policy's distance is measured with."""
 
 
 class PolicyStage(Stage):
@@ -121,15 +114,6 @@ class PolicyStage(Stage):
         kept = min(trainings, key=lambda training: training.distance)
         ordered = (kept, *(training for training in trainings if training is not kept))
         return artifacts[kept.job].files() | Trainings(ordered).files()
-
-
-def distance_of(
-    policy: GaussianPolicy, reward: "AdversarialReward", environment: EnvironmentConfig, seed: int
-) -> float:
-    """Return how far fresh episodes of mean actions are from the demonstrations that a reward model was made for."""
-    simulators = make_batch(environment.id, environment.dynamics, DISTANCE_EPISODES)
-    episodes = run_episodes(simulators, policy, numpy_rng(derive_key(seed, "distance")), stochastic=False)
-    return reward.distance(episodes)
 
 
 register(PolicyStage("imitation", title="ours", weighting="transferability"))

@@ -1,30 +1,34 @@
-"""Stage 4: how transferable every demonstration is, read from the discriminators of the clusters' imitators (Eqn 6).
+"""Stage 4: how transferable each demonstration is, and its weight, from readings of the clusters' imitators (Eqn 6).
 
-A discriminator is read after it has gone on learning for a while against the finished imitator. One job per imitator;
-what is done with the readings (which training counts, weights) trains nothing again.
+One job per imitator; what is done with the readings (which training counts, verdicts, weights) trains nothing again.
 """
 
 from typing import Any
 
 import numpy as np
 
-from oodil.pipeline.algorithms.weights import share_lasted, sharpened_weights, transferability_of_logits
+from oodil.pipeline.algorithms.weights import intervals, kept_weights, share_lasted, transferability_of_divergences
 from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.environments import environment_spec
+from oodil.pipeline.environments import environment_spec, make_batch
+from oodil.pipeline.evaluation import run_episodes
+from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.results import (
     Imitator,
+    Reading,
     ScoreHistory,
     Transferability,
-    discriminator_file,
     load_cluster_model,
-    load_discriminator,
 )
+from oodil.pipeline.seeding import derive_key, numpy_rng
 from oodil.pipeline.stage import JobContext, Run, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 from oodil.pipeline.stages.imitators import ClusterJob, ImitatorsStage, cluster_of, load_assignment
 from oodil.pipeline.stages.weighting import Weighting
+
+READ_EPISODES = 32
+"""Fresh episodes of an imitator that its demonstrations are held against."""
 
 
 class TransferabilityStage(Weighting):
@@ -32,55 +36,62 @@ class TransferabilityStage(Weighting):
 
     name = "transferability"
     title = "ours"
-    version = 2
+    version = 3
     inputs = ("demonstrations", "clustering", "imitators")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
-        """Return how the discriminators are read, and how scores become weights."""
-        return self.job_settings(config) | {"sharpening": config.transferability.sharpening}
+        """Return how the imitators are read, and how scores become weights."""
+        return self.job_settings(config) | {"kept_from": config.transferability.kept_from}
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
-        """Return how the discriminators are read."""
-        return {"final_steps": config.transferability.final_steps}
+        """Return how the imitators are read."""
+        return {"reading": config.transferability.reading.model_dump()}
 
     def rule(self, config: RunConfig) -> str:
-        """Say how sharp the weights are."""
-        power = config.transferability.sharpening
-        return super().rule(config) + ("" if power == 1 else f" to the power {power:g}")
+        """Say what is kept."""
+        share = config.transferability.kept_from
+        return (
+            "a demonstration is drawn for imitation in proportion to its score, times the share of its readings that "
+            f"reach {share:.0%} of the best cluster's score"
+        )
 
     def jobs(self, run: Run) -> list[str]:
         """Return one job per imitator, under its name."""
         return ImitatorsStage().jobs(run)
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
-        """Let a discriminator go on against the imitator as it is, and score the demonstrations of its cluster."""
-        from oodil.pipeline.training import experience
+        """Read the demonstrations of a cluster against fresh episodes of its imitator."""
+        cluster, reading = ClusterJob.of(run, job), run.config.transferability.reading
+        imitator = Imitator.load(run.job_artifact(ImitatorsStage.name, job))
+        readers, played = cluster.readers(run.config), self._episodes(run.config, cluster, imitator.policy)
+        divergences = readers.train(played, reading)
+        return Reading(cluster.members, divergences, int((played.lengths - 1).sum()), readers.arrays()).files()
 
-        config, section = run.config, run.config.transferability
-        cluster = ClusterJob.of(run, job)
-        trained = run.job_artifact(ImitatorsStage.name, job)
-        imitator = Imitator.load(trained)
-        reward = cluster.reward(config, imitator.discriminator)
-        horizon = environment_spec(config.environment.id, config.environment.dynamics).max_episode_steps
-        batch = experience(imitator.policy, config.environment, section.gail, horizon, cluster.seed, context)
-        reward.settle(batch, section.final_steps, section.gail.steps_per_iteration)
-        history = ScoreHistory.load(trained).then(batch.terminated.size, reward.mean_logits(cluster.demonstrations))
-        return history.files() | discriminator_file(reward.discriminator_arrays())
+    def _episodes(self, config: RunConfig, cluster: ClusterJob, policy: GaussianPolicy) -> Demonstrations:
+        """Return fresh episodes of an imitator, with the noise that it has been trained to."""
+        simulators = make_batch(config.environment.id, config.environment.dynamics, READ_EPISODES)
+        rng, starts = numpy_rng(derive_key(cluster.seed, "episodes")), cluster.starts(config)
+        return Demonstrations.of(run_episodes(simulators, policy, rng, stochastic=True, starts=starts), "imitator")
 
     def combine(self, run: Run) -> Files:
-        """Take each cluster's closest imitator and turn the scores into weights."""
-        demonstrations = load_demonstrations(run)
-        logits = np.full(len(demonstrations), np.nan)
+        """Take each cluster's closest imitator and turn its readings into scores, verdicts and weights."""
+        demonstrations, section = load_demonstrations(run), run.config.transferability
+        divergences = np.empty((section.reading.repetitions, len(demonstrations)))
         history, env_steps = {}, 0
         for cluster, jobs in self._by_cluster(run).items():
-            readings = {job: ScoreHistory.load(run.job_artifact(self.name, job)) for job in jobs}
-            env_steps += sum(int(reading.env_steps[-1] - reading.env_steps[-2]) for reading in readings.values())
-            history[cluster] = readings[_closest(readings)]
-            logits[history[cluster].demonstrations] = history[cluster].logits[-1]
-        return self._weighted(run, demonstrations, logits, load_assignment(run).labels, env_steps, history).files()
+            env_steps += sum(Reading.load(run.job_artifact(self.name, job)).env_steps for job in jobs)
+            job = self._closest(run, jobs)
+            reading = Reading.load(run.job_artifact(self.name, job))
+            divergences[:, reading.demonstrations] = reading.divergences
+            history[cluster] = ScoreHistory.load(run.job_artifact(ImitatorsStage.name, job))
+        labels = load_assignment(run).labels
+        readings = self._readings(run.config, demonstrations, divergences)
+        best = max(float(readings[:, labels == cluster].mean()) for cluster in history)
+        threshold = section.kept_from * best
+        return self._judged(readings, labels, threshold, env_steps, history).files()
 
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
-        """Return scores by the frozen clusters and discriminators, and weights among these demonstrations.
+        """Return scores by the frozen clusters and readers, and weights among these demonstrations.
 
         Raises DataError when the states have another dimension than those of the run.
         """
@@ -88,20 +99,17 @@ class TransferabilityStage(Weighting):
 
         model = ClusterModel.from_arrays(load_cluster_model(run.artifact("clustering")))
         labels = model.label(demonstrations, run.config.clustering.label_draws, run.config.seed).labels
-        logits = np.full(len(demonstrations), np.nan)
+        divergences = np.full((2 * run.config.transferability.reading.repetitions, len(demonstrations)), np.inf)
         by_cluster = self._by_cluster(run)
-        for cluster in np.unique(labels).tolist():
-            if cluster not in by_cluster:
-                logits[labels == cluster] = np.inf  # Nothing like it was imitated, so nothing of it is reproduced.
-                continue
-            jobs = by_cluster[cluster]
-            readings = {job: ScoreHistory.load(run.job_artifact(self.name, job)) for job in jobs}
-            job = _closest(readings)
-            settled = load_discriminator(run.job_artifact(self.name, job))
-            reward = ClusterJob.of(run, job).reward(run.config, settled)
+        for cluster in set(np.unique(labels).tolist()) & set(by_cluster):
+            job = self._closest(run, by_cluster[cluster])
+            reading = Reading.load(run.job_artifact(self.name, job))
+            readers = ClusterJob.of(run, job).readers(run.config)
+            readers.load(reading.readers)
             members = np.flatnonzero(labels == cluster)
-            logits[members] = reward.mean_logits(demonstrations.select(members))
-        return self._weighted(run, demonstrations, logits, labels, 0, {})
+            divergences[:, members] = readers.divergences(demonstrations.select(members))
+        readings = self._readings(run.config, demonstrations, divergences)
+        return self._judged(readings, labels, self.load(run).threshold, 0, {})
 
     def _by_cluster(self, run: Run) -> dict[int, list[str]]:
         """Return the jobs of each cluster that has demonstrations."""
@@ -110,25 +118,32 @@ class TransferabilityStage(Weighting):
             jobs.setdefault(cluster_of(job), []).append(job)
         return jobs
 
-    def _weighted(
+    def _closest(self, run: Run, jobs: list[str]) -> str:
+        """Return the job whose imitator comes closest to its cluster: what one can reproduce is transferable."""
+        return min(jobs, key=lambda job: Imitator.load(run.job_artifact(ImitatorsStage.name, job)).distance)
+
+    def _readings(self, config: RunConfig, demonstrations: Demonstrations, divergences: np.ndarray) -> np.ndarray:
+        environment = config.environment
+        horizon = environment_spec(environment.id, environment.dynamics).max_episode_steps
+        return transferability_of_divergences(divergences) * share_lasted(demonstrations, horizon)
+
+    def _judged(
         self,
-        run: Run,
-        demonstrations: Demonstrations,
-        logits: np.ndarray,
+        readings: np.ndarray,
         labels: np.ndarray,
+        threshold: float,
         env_steps: int,
         history: dict[int, ScoreHistory],
     ) -> Transferability:
-        environment = run.config.environment
-        horizon = environment_spec(environment.id, environment.dynamics).max_episode_steps
-        scores = transferability_of_logits(logits) * share_lasted(demonstrations, horizon)
-        weights = sharpened_weights(scores, run.config.transferability.sharpening)
-        return Transferability(scores, weights, labels, env_steps, history)
-
-
-def _closest(readings: dict[str, ScoreHistory]) -> str:
-    """Return the job whose imitator is told apart least: what one imitator can reproduce is transferable."""
-    return min(readings, key=lambda job: float(readings[job].logits[-1].mean()))
+        return Transferability(
+            scores=readings.mean(axis=0),
+            weights=kept_weights(readings, threshold),
+            clusters=labels,
+            intervals=intervals(readings),
+            threshold=threshold,
+            env_steps=env_steps,
+            history=history,
+        )
 
 
 register(TransferabilityStage())

@@ -57,13 +57,11 @@ def test_reward_by_hand():
     # -log(1 - D): D = 1/2 -> log 2, D = 3/4 -> log 4, D = 1/4 -> log(4/3)
     logits = torch.tensor([0.0, math.log(3), -math.log(3)])
     expected = torch.tensor([math.log(2), math.log(4), math.log(4 / 3)])
-    torch.testing.assert_close(imitation_reward(logits, "positive"), expected)
-    # log D - log(1 - D): D = 1/2 -> 0, D = 3/4 -> log 3, D = 1/4 -> -log 3
-    torch.testing.assert_close(imitation_reward(logits, "logit"), logits)
+    torch.testing.assert_close(imitation_reward(logits), expected)
 
 
 def test_reward_is_positive_and_grows_with_the_logit():
-    rewards = imitation_reward(torch.linspace(-20, 20, 401), "positive")
+    rewards = imitation_reward(torch.linspace(-20, 20, 401))
     assert (rewards > 0).all()
     assert (rewards.diff() > 0).all()
 
@@ -88,8 +86,7 @@ def test_training_separates_the_two_and_rewards_what_looks_like_a_demonstration(
     assert metrics[-1]["policy_accuracy"] > 0.95
     with torch.no_grad():
         assert (
-            imitation_reward(discriminator(demonstration), "positive").mean()
-            > 2 * imitation_reward(discriminator(policy), "positive").mean()
+            imitation_reward(discriminator(demonstration)).mean() > 2 * imitation_reward(discriminator(policy)).mean()
         )
 
 

@@ -7,7 +7,8 @@ from scipy.stats import wasserstein_distance
 from oodil.pipeline.algorithms.divergence import sliced_wasserstein
 
 
-def test_in_one_dimension_it_is_scipys(rng=np.random.default_rng(0)):
+def test_in_one_dimension_it_is_scipys():
+    rng = np.random.default_rng(0)
     a, b = rng.normal(size=(4000, 1)), rng.normal(0.7, 2.0, size=(3000, 1))
     expected = wasserstein_distance(a[:, 0], b[:, 0])
     assert sliced_wasserstein(a, b, np.random.default_rng(1)) == pytest.approx(expected, rel=0.01)
@@ -16,7 +17,9 @@ def test_in_one_dimension_it_is_scipys(rng=np.random.default_rng(0)):
 def test_a_shift_costs_its_mean_length_along_the_directions():
     points = np.random.default_rng(0).normal(size=(2000, 3))
     # The mean of |u . e| over unit vectors u of three dimensions is 1/2.
-    assert sliced_wasserstein(points, points + [2.0, 0, 0], np.random.default_rng(1)) == pytest.approx(1.0, rel=0.15)
+    assert sliced_wasserstein(points, points + np.array([2.0, 0, 0]), np.random.default_rng(1)) == pytest.approx(
+        1.0, rel=0.15
+    )
 
 
 def test_it_is_zero_for_the_same_points_in_another_order_and_symmetric():

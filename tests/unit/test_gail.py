@@ -89,7 +89,7 @@ def test_rewards_belong_to_the_steps_that_earned_them(demonstrations, rollout):
             states = rollouts[part].observations[t, column], rollouts[part].next_observations[t, column]
             with torch.no_grad():
                 logit = reward.discriminator(torch.from_numpy(np.concatenate(states))[None])
-            assert result[t, g] == pytest.approx(float(imitation_reward(logit, "positive")[0]), rel=1e-5)
+            assert result[t, g] == pytest.approx(float(imitation_reward(logit)[0]), rel=1e-5)
 
 
 def test_inputs_are_built_once_for_a_batch(demonstrations, rollout, monkeypatch):
@@ -118,9 +118,7 @@ def test_update_raises_the_reward_of_demonstrations(demonstrations, rollout):
 
     def margin():
         with torch.no_grad():
-            return float(imitation_reward(reward.discriminator(pairs), "positive").mean()) - float(
-                reward.rewards(batch).mean()
-            )
+            return float(imitation_reward(reward.discriminator(pairs)).mean()) - float(reward.rewards(batch).mean())
 
     before = margin()
     for iteration in range(20):
