@@ -153,6 +153,8 @@ class GailConfig(TrainingConfig):
     """Adversarial imitation: training whose reward comes from a discriminator."""
 
     final_std: PositiveFloat | None = 0.1
+    """What the policy's standard deviation shrinks to in the second half of the training, and never falls below, so
+    that mean actions do what sampled ones learned; null leaves it alone."""
     discriminator: DiscriminatorConfig = DiscriminatorConfig()
     """What tells demonstrations from the policy."""
 

@@ -30,7 +30,8 @@ class Distance(Weighting):
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
         ground = np.array([abs(float(demonstrations[n][-1, 0])) for n in range(len(demonstrations))])
         scores = ground / (1 + ground)
-        return Transferability(scores, scores / scores.sum(), np.full(len(scores), -1, np.int32))
+        exact = np.stack((scores, scores), axis=1)
+        return Transferability(scores, scores / scores.sum(), np.full(len(scores), -1, np.int32), exact, threshold=0.5)
 
 
 register(Distance())

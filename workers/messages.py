@@ -139,6 +139,7 @@ _ARRAYS: dict[str, dict[str, tuple[str, str]]] = {
         "policy.log_std": ("<f4", "A"),
         "policy.input_mean": ("<f4", "S"),
         "policy.input_scale": ("<f4", "S"),
+        "policy.input_limit": ("<f4", ""),
         "starts": ("<f4", "PS"),
         **_SNAPSHOT,
     },

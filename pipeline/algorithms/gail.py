@@ -84,20 +84,6 @@ class AdversarialReward:
             metrics = self.discriminator.update(self.draw(len(chosen), rng), policy_inputs[torch.from_numpy(chosen)])
         return metrics
 
-    def settle(self, batch: TransitionBatch, steps: int, batch_size: int) -> None:
-        """Train the discriminator alone, against a batch of a policy that no longer changes.
-
-        While both learn, the discriminator lags behind the policy, and even an imitator that fails may fool it for a
-        while. Each of the ``steps`` draws ``batch_size`` pairs from either side. The optimizer is reset: its moments
-        belong to a policy that was changing, and its learning rate had been annealed.
-        """
-        self.discriminator.restart_optimizer()
-        policy_inputs = self._inputs_of(batch)
-        rng = numpy_rng(derive_key(self.root_seed, "discriminator", "settle"))
-        for _ in range(steps):
-            chosen = torch.from_numpy(rng.integers(len(policy_inputs), size=batch_size))
-            self.discriminator.update(self.draw(batch_size, rng), policy_inputs[chosen])
-
     def distance(self, episodes: Sequence[Episode]) -> float:
         """Return how far episodes are from the weighted demonstrations, in deviations of what the discriminator sees.
 
@@ -117,12 +103,8 @@ class AdversarialReward:
         return self.discriminator.inputs(self._observations[starts], self._observations[starts + 1])
 
     def discriminator_arrays(self) -> dict[str, NDArray[np.float32]]:
-        """Return the discriminator's parameters by name; `load_discriminator` is the inverse."""
+        """Return the discriminator's parameters by name."""
         return {name: value.numpy() for name, value in self.discriminator.state_dict().items()}
-
-    def load_discriminator(self, arrays: dict[str, NDArray[np.float32]]) -> None:
-        """Take over a trained discriminator."""
-        self.discriminator.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})
 
     def mean_logits(self, demonstrations: Demonstrations) -> NDArray[np.float64]:
         """Return (N,) mean logits of the current discriminator over each demonstration."""

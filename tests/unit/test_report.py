@@ -69,6 +69,11 @@ def new_run(
     return Run(parse_config(values | sections, origin="test"), RunDirectory(folder))
 
 
+def exact(scores: Any, weights: Any, clusters: Any) -> Transferability:
+    """Scores without doubt."""
+    return Transferability(scores, weights, clusters, np.stack((scores, scores), axis=1), threshold=0.5)
+
+
 class Writer:
     """Writes the artifacts of a synthetic run, each a function of the seed, in the order of the stages."""
 
@@ -143,15 +148,16 @@ class Writer:
             end = scores[members][None]
             seen = end + (0.45 - end) * np.exp(-6 * progress)
             history[k] = ScoreHistory(members, steps, np.log(1 / seen - 1))
-        self.write(
-            "transferability", Transferability(scores, scores / scores.sum(), self.labels, 20_000, history).files()
-        )
+        band = np.clip(np.stack((scores - 0.03, scores + 0.03), axis=1), 0, 1)
+        weights = scores / scores.sum()
+        found = Transferability(scores, weights, self.labels, band, 0.2, env_steps=20_000, history=history)
+        self.write("transferability", found.files())
 
     def marks(self) -> None:
         """One or zero."""
         scores = np.array([mark is True for mark in self.known], np.float64)[self.sources]
         none = np.full(len(scores), -1, np.int32)
-        self.write("marks", Transferability(scores, scores / max(scores.sum(), 1), none).files())
+        self.write("marks", exact(scores, scores / max(scores.sum(), 1), none).files())
 
     def policy(self, stage: str, mean: float, episodes: int = 32, env_steps: int = 5_000_000, points: int = 12) -> None:
         """A learning curve that ends near the final return."""
@@ -387,7 +393,7 @@ def test_a_registered_method_appears(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "Missing: by_length, longest, not computed yet." in render(run).text
     lengths = RunResults(run).demonstrations.lengths
     none = np.full(len(lengths), -1, np.int32)
-    writer.write("by_length", Transferability(lengths / 20, lengths / lengths.sum(), none).files())
+    writer.write("by_length", exact(lengths / 20, lengths / lengths.sum(), none).files())
     writer.policy("longest", 1500.0)
     page = render(run)
     assert page.tags.count("svg") == 5
@@ -600,7 +606,7 @@ def small_sources(scores: list[float]) -> tuple[Sources, Transferability]:
     episodes = [Episode(np.zeros((length, 2))) for length in (7, 2, 2)]
     held = replace(Demonstrations.of(episodes, "a"), sources=np.array([0, 1, 1], np.int32), source_labels=("a", "b"))
     without_clusters = np.full(3, -1, np.int32)
-    return Sources(each, held), Transferability(np.array(scores), np.ones(3) / 3, without_clusters)
+    return Sources(each, held), exact(np.array(scores), np.ones(3) / 3, without_clusters)
 
 
 def test_shares_of_the_sampling_mass_count_transitions() -> None:

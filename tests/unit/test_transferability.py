@@ -1,4 +1,4 @@
-"""From logits to scores to weights, by hand."""
+"""From readings to scores to weights, by hand."""
 
 from dataclasses import replace
 
@@ -8,12 +8,15 @@ import torch
 
 from oodil.pipeline.algorithms.discriminator import Discriminator, mean_logit_per_demonstration
 from oodil.pipeline.algorithms.weights import (
+    effective_number,
+    intervals,
+    kept_weights,
     sampling_mass,
     share_lasted,
-    sharpened_weights,
-    transferability_of_logits,
+    transferability_of_divergences,
 )
 from oodil.pipeline.config import DiscriminatorConfig
+from oodil.pipeline.results import Transferability
 
 
 def test_mean_logit_is_over_the_transitions_of_each_demonstration(demonstrations):
@@ -29,8 +32,10 @@ def test_mean_logit_is_over_the_transitions_of_each_demonstration(demonstrations
     np.testing.assert_allclose(mean_logit_per_demonstration(discriminator, made), expected, rtol=1e-5)
 
 
-def test_transferability_is_half_where_nothing_can_be_told_and_falls_with_the_logit():
-    np.testing.assert_allclose(transferability_of_logits(np.array([0.0, np.log(3.0), -np.log(3.0)])), [0.5, 0.25, 0.75])
+def test_transferability_is_one_where_nothing_can_be_told_and_falls_with_the_divergence():
+    # D = sigmoid(divergence / 2): 0 -> 1/2, 2 log 3 -> 3/4; what looks more like the imitator than itself is no better.
+    found = transferability_of_divergences(np.array([0.0, 2 * np.log(3.0), -1.0, np.inf]))
+    np.testing.assert_allclose(found, [1, 0.5, 1, 0])
 
 
 def test_a_failure_counts_for_the_part_of_the_horizon_that_it_lasted(demonstrations):
@@ -39,12 +44,29 @@ def test_a_failure_counts_for_the_part_of_the_horizon_that_it_lasted(demonstrati
     np.testing.assert_allclose(share_lasted(made, 20), [0.25, 1, 1, 1])
 
 
-def test_weights_are_powers_of_the_scores():
-    scores = np.array([0.4, 0.2, 0.0])
-    np.testing.assert_allclose(sharpened_weights(scores, 1.0), [2 / 3, 1 / 3, 0])
-    np.testing.assert_allclose(sharpened_weights(scores, 2.0), [0.8, 0.2, 0])
-    np.testing.assert_allclose(sharpened_weights(np.zeros(4), 2.0), [0.25] * 4)
-    np.testing.assert_allclose(sharpened_weights(np.array([1e-300, 2e-300]), 2.0), [0.2, 0.8])
+def test_weights_are_scores_times_the_share_of_readings_that_reach_the_threshold():
+    readings = np.array([[0.8, 0.5, 0.1], [0.4, 0.3, 0.2]])
+    np.testing.assert_allclose(kept_weights(readings, 0.4), [0.6 / 0.8, 0.2 / 0.8, 0])
+    np.testing.assert_allclose(kept_weights(readings, 0.9), [1 / 3] * 3)
+
+
+def test_an_interval_is_two_deviations_around_the_mean_and_everything_with_one_reading():
+    readings = np.array([[0.5, 0.9, 0.0], [0.3, 0.9, 0.1]])
+    spread = 2 * np.sqrt(0.02)
+    expected = [[0.4 - spread, 0.4 + spread], [0.9, 0.9], [0, 0.05 + spread / 2]]
+    np.testing.assert_allclose(intervals(readings), expected)
+    np.testing.assert_allclose(intervals(readings[:1]), [[0, 1]] * 3)
+
+
+def test_verdicts_follow_from_the_interval():
+    limits = np.array([[0.5, 0.7], [0.4, 0.6], [0.1, 0.49]])
+    found = Transferability(limits.mean(axis=1), np.ones(3) / 3, np.zeros(3, np.int32), limits, threshold=0.5)
+    assert found.verdicts.tolist() == ["kept", "open", "not kept"]
+
+
+def test_the_effective_number_counts_equal_weights():
+    assert effective_number(np.array([0.2, 0.2, 0.2, 0.0])) == pytest.approx(3)
+    assert effective_number(np.array([1.0, 1e-9])) == pytest.approx(1)
 
 
 def test_mass_is_weight_times_transitions(demonstrations):
