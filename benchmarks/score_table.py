@@ -78,8 +78,8 @@ def main() -> None:
             name = "-".join([config, *arguments.set, f"seed{seed}"]).replace("/", "-").replace("=", "")
             run = oodil.run(config, [f"seed={seed}", *arguments.set], run_dir=arguments.runs / name)
             lines.append(line_of(run))
-            print({key: lines[-1].get(key) for key in ("config", "seed", "auroc", "share", "effective_number")},
-                  {name: round(each["mean_return"]) for name, each in lines[-1]["policies"].items()}, flush=True)  # fmt: skip
+            returns = {policy: round(each["mean_return"]) for policy, each in lines[-1]["policies"].items()}
+            print({key: lines[-1].get(key) for key in ("config", "seed", *WORST)}, returns, flush=True)
             save(arguments.json, found | {"runs": lines})
     print(table_of(lines))
 

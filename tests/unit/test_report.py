@@ -33,6 +33,8 @@ from oodil.pipeline.results import (
     Policy,
     ScoreHistory,
     TrainedImitators,
+    Training,
+    Trainings,
     Transferability,
 )
 from oodil.pipeline.runs import RunResults
@@ -185,7 +187,8 @@ class Writer:
             action_high=np.ones(3, np.float32),
             env_steps=env_steps,
         )
-        self.write(stage, policy.files() | curve.files() | final.files())
+        kept = Training("training-1", env_steps, 0.2, final.mean_return)
+        self.write(stage, policy.files() | curve.files() | final.files() | Trainings((kept,)).files())
 
     def steps(self) -> dict[str, Callable[[], None]]:
         """Return what writes each stage, in their order."""
@@ -501,10 +504,10 @@ def test_sources_may_be_unknown_and_features_trivial(tmp_path: Path) -> None:
 def test_stale_stages_are_not_shown_and_named_with_the_reason(tmp_path: Path) -> None:
     run = full_run(tmp_path, **SMALL)
     changed = new_run(tmp_path, SMALL["marks"], SMALL["counts"], transferability={
-        "gail": {"total_steps": 5_000_000}, "sharpening": 1.0,
+        "gail": {"total_steps": 5_000_000}, "kept_from": 0.3,
     })  # fmt: skip
     page = render(changed)
-    assert "Missing: transferability, stale: sharpening 4.0 -> 1.0." in page.text
+    assert "Missing: transferability, stale: kept_from 0.5 -> 0.3." in page.text
     assert "Missing: imitation, stale: its input transferability is stale." in page.text
     assert "2,951" not in page.text and "846" in page.text
     assert "weighting “marks”" in page.text and "weighting “ours”" not in page.text
