@@ -292,7 +292,7 @@ class Transferability:
     """What a weighting says of every demonstration."""
 
     scores: NDArray[np.float64]
-    """(N,) in [0, 1], higher where the imitator can reproduce more."""
+    """(N,) in [0, 1], higher where the imitator can reproduce more; NaN for new ones that are unlike any it knows."""
     weights: NDArray[np.float64]
     """(N,) not negative, summing to one."""
     clusters: NDArray[np.int32]
@@ -308,9 +308,13 @@ class Transferability:
 
     @property
     def verdicts(self) -> NDArray[np.str_]:
-        """(N,) ``kept`` if the whole interval reaches the threshold, ``not kept`` if none of it does, else ``open``."""
+        """(N,) ``kept`` if the whole interval reaches the threshold, ``not kept`` if none of it does, else ``open``.
+
+        One without a score is ``unlike`` all that the run has seen.
+        """
         low, high = self.intervals.T
-        return np.where(low >= self.threshold, "kept", np.where(high < self.threshold, "not kept", "open"))
+        told = np.where(low >= self.threshold, "kept", np.where(high < self.threshold, "not kept", "open"))
+        return np.where(np.isnan(self.scores), "unlike", told)
 
     def files(self) -> Files:
         """Return the artifact's content."""

@@ -33,6 +33,8 @@ class Readers:
         weights = np.ones(len(demonstrations))
         seeds = [torch_seed(derive_key(seed, "reading", "initial", d)) for d in range(2 * repetitions)]
         self._nets = [Discriminator(demonstrations, weights, config, each) for each in seeds]
+        self.view = self._nets[0]
+        """Any of them: all see transitions in the same way."""
         self._references = np.zeros(len(self._nets))
         """(D,) mean logit of each over the episodes that it has not seen."""
 
@@ -76,7 +78,7 @@ class Readers:
             net.load_state_dict({name: torch.from_numpy(value) for name, value in below(str(d), arrays).items()})
 
     def _transitions(self, demonstrations: Demonstrations) -> "_Transitions":
-        return _Transitions(demonstrations, self._nets[0])
+        return _Transitions(demonstrations, self.view)
 
 
 class _Transitions:

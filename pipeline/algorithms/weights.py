@@ -34,9 +34,9 @@ def share_lasted(demonstrations: Demonstrations, horizon: int) -> Array:
 def kept_weights(readings: Array, threshold: float) -> Array:
     """Return (N,) weights that sum to one: the mean score, times the share of readings that reach the threshold.
 
-    ``readings`` are (R, N) scores. Weights are uniform when no reading reaches it.
+    ``readings`` are (R, N) scores, NaN where there is none. Weights are uniform when no reading reaches it.
     """
-    weights = readings.mean(axis=0) * (readings >= threshold).mean(axis=0)
+    weights = np.nan_to_num(readings.mean(axis=0)) * (readings >= threshold).mean(axis=0)
     return np.asarray(weights / weights.sum()) if weights.sum() > 0 else np.full(len(weights), 1 / len(weights))
 
 

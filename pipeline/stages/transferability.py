@@ -93,12 +93,17 @@ class TransferabilityStage(Weighting):
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
         """Return scores by the frozen clusters and readers, and weights among these demonstrations.
 
+        One that is unlike all members of its cluster (`Neighborhood`) gets no score.
+
         Raises DataError when the states have another dimension than those of the run.
         """
         from oodil.pipeline.algorithms.clustering import ClusterModel
+        from oodil.pipeline.algorithms.novelty import Neighborhood
 
         model = ClusterModel.from_arrays(load_cluster_model(run.artifact("clustering")))
-        labels = model.label(demonstrations, run.config.clustering.label_draws, run.config.seed).labels
+        labeled = model.label(demonstrations, run.config.clustering.label_draws, run.config.seed)
+        labels, assignment, known = labeled.labels, load_assignment(run), load_demonstrations(run)
+        unlike = ~np.isin(labels, assignment.labels)
         divergences = np.full((2 * run.config.transferability.reading.repetitions, len(demonstrations)), np.inf)
         by_cluster = self._by_cluster(run)
         for cluster in set(np.unique(labels).tolist()) & set(by_cluster):
@@ -106,9 +111,13 @@ class TransferabilityStage(Weighting):
             reading = Reading.load(run.job_artifact(self.name, job))
             readers = ClusterJob.of(run, job).readers(run.config)
             readers.load(reading.readers)
-            members = np.flatnonzero(labels == cluster)
-            divergences[:, members] = readers.divergences(demonstrations.select(members))
+            new, members = np.flatnonzero(labels == cluster), assignment.members(cluster)
+            chosen = demonstrations.select(new)
+            divergences[:, new] = readers.divergences(chosen)
+            around = Neighborhood(known.select(members), assignment.features[members], readers.view)
+            unlike[new] = around.unlike(chosen, labeled.features[new])
         readings = self._readings(run.config, demonstrations, divergences)
+        readings[:, unlike] = np.nan
         return self._judged(readings, labels, self.load(run).threshold, 0, {})
 
     def _by_cluster(self, run: Run) -> dict[int, list[str]]:

@@ -9,6 +9,7 @@ import pytest
 import safetensors.numpy
 import torch
 
+import oodil.pipeline.algorithms.learner as learner_module
 from oodil.pipeline.algorithms.gail import AdversarialReward
 from oodil.pipeline.algorithms.learner import EnvReward, Learner
 from oodil.pipeline.artifacts import encode_arrays
@@ -261,3 +262,49 @@ def test_steps_shrink_linearly_over_the_training(shown, rollout, anneal, expecte
     for iteration in range(4):
         learner.update(TransitionBatch.of([rollout(iteration)]), iteration)
     assert Recording.scales == expected
+
+
+class TestEnds:
+    """What the end of an episode is worth to an imitator."""
+
+    @pytest.mark.parametrize(("lengths", "share"), [((21, 21), 0.0), ((21, 11), 0.5), ((5, 11), 1.0)])
+    def test_it_is_the_share_of_the_demonstrations_that_end_before_the_time_limit(self, demonstrations, lengths, share):
+        shown = demonstrations(*lengths)
+        assert AdversarialReward(shown, np.ones(2), DiscriminatorConfig(), 20, 0).ended_share == share
+        weighted = AdversarialReward(shown, np.array([1.0, 0.0]), DiscriminatorConfig(), 20, 0)
+        assert weighted.ended_share == float(lengths[0] < 21)
+
+    def test_the_last_reward_goes_on_for_ever(self, demonstrations, rollout, monkeypatch):
+        """With discount 1/2 a reward r for ever is worth 2 r, and half of the demonstrations end."""
+        config = GailConfig(total_steps=100, discount=0.5)
+        reward = AdversarialReward(demonstrations(21, 11), np.ones(2), DiscriminatorConfig(), 20, 0)
+        learner, batch = Learner(3, 2, config, reward, 0), TransitionBatch.of([rollout(0)])
+        batch.terminated[2, 1] = True
+        plain = learner.reward_model.rewards(batch)
+        seen = []
+
+        def advantages(rewards, *rest):
+            seen.append(rewards)
+            return rewards
+
+        monkeypatch.setattr(learner_module, "generalized_advantages", advantages)
+        learner.update(batch, 0)
+        expected = np.where(batch.terminated, 1.5 * plain, plain)
+        np.testing.assert_allclose(seen[0], expected, rtol=1e-6)
+
+
+def test_noise_shrinks_in_the_second_half_and_never_falls_below_its_last_value(demonstrations, rollout):
+    config = GailConfig(total_steps=6 * 10, num_groups=1, simulators_per_group=2, steps_per_rollout=3, final_std=0.2)
+    assert config.num_iterations == 10
+    learner = Learner(3, 2, config, AdversarialReward(demonstrations(9), np.ones(1), DiscriminatorConfig(), 9, 0), 0)
+    with torch.no_grad():
+        learner.policy.log_std[1] = -5.0
+    ceilings = []
+    for iteration in range(10):
+        learner.update(TransitionBatch.of([rollout(iteration)]), iteration)
+        ceilings.append(learner.policy.log_std.detach().exp().tolist())
+    assert all(low == pytest.approx(0.2) for _, low in ceilings)
+    assert ceilings[4][0] > 0.8
+    for i, factor in enumerate((0.8, 0.6, 0.4, 0.2, 0.0), start=5):
+        assert ceilings[i][0] <= 0.2 ** (1 - factor) + 1e-6
+    assert ceilings[-1][0] == pytest.approx(0.2)
