@@ -303,7 +303,7 @@ def test_noise_shrinks_in_the_second_half_and_never_falls_below_its_last_value(d
     for iteration in range(10):
         learner.update(TransitionBatch.of([rollout(iteration)]), iteration)
         ceilings.append(learner.policy.log_std.detach().exp().tolist())
-    assert all(low == pytest.approx(0.2) for _, low in ceilings)
+    assert all(low >= 0.2 - 1e-6 for _, low in ceilings)
     assert ceilings[4][0] > 0.8
     for i, factor in enumerate((0.8, 0.6, 0.4, 0.2, 0.0), start=5):
         assert ceilings[i][0] <= 0.2 ** (1 - factor) + 1e-6
