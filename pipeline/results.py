@@ -303,6 +303,8 @@ class Transferability:
     """From which score a demonstration is kept."""
     env_steps: int = 0
     """Environment steps that the weighting took."""
+    read_from: dict[int, str] = field(default_factory=dict)
+    """By cluster, the job whose imitator was read, where several were trained."""
     history: dict[int, ScoreHistory] = field(default_factory=dict)
     """By cluster, for a weighting that trains imitators: how its demonstrations were told from them meanwhile."""
 
@@ -325,7 +327,9 @@ class Transferability:
         return {
             _SCORES: encode_arrays(arrays),
             _HISTORY: encode_arrays(history),
-            _SUMMARY: encode_json({"threshold": self.threshold, "env_steps": self.env_steps}),
+            _SUMMARY: encode_json(
+                {"threshold": self.threshold, "env_steps": self.env_steps, "read_from": self.read_from}
+            ),
         }
 
     @classmethod
@@ -336,8 +340,9 @@ class Transferability:
             cluster, _, name = key.removeprefix("cluster_").partition("/")
             named.setdefault(int(cluster), {})[name] = array
         history = {k: ScoreHistory(**named[k]) for k in sorted(named)}
-        arrays: dict[str, Any] = artifact.arrays(_SCORES) | artifact.json(_SUMMARY)
-        return cls(**arrays, history=history)
+        held: dict[str, Any] = artifact.arrays(_SCORES) | artifact.json(_SUMMARY)
+        held["read_from"] = {int(cluster): job for cluster, job in held["read_from"].items()}
+        return cls(**held, history=history)
 
     def columns(self) -> Arrays:
         """Return (N,) arrays by the names that tables and exported files use."""

@@ -7,6 +7,8 @@ imitator's episodes, and read the other halves.
 Letters: N demonstrations, E episodes, R repetitions, D discriminators (two in each repetition), B batch.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -38,7 +40,12 @@ class Readers:
         self._references = np.zeros(len(self._nets))
         """(D,) mean logit of each over the episodes that it has not seen."""
 
-    def train(self, episodes: Demonstrations, config: ReadingConfig) -> Array:
+    def train(
+        self,
+        episodes: Demonstrations,
+        config: ReadingConfig,
+        progress: Callable[[int, int], None] = lambda done, total: None,
+    ) -> Array:
         """Train all of them, and return the (R, N) divergences of the demonstrations, none read by one that saw it.
 
         A single demonstration has no halves, and is read by those that have seen it.
@@ -56,6 +63,7 @@ class Readers:
             self._references[d] = played.mean_logits(net)[~half_played].mean()
             unseen = ~half_shown if len(half_shown) > 1 else np.array([True])
             found[r, unseen] = shown.mean_logits(net)[unseen] - self._references[d]
+            progress(d + 1, len(self._nets))
         return found
 
     def divergences(self, demonstrations: Demonstrations) -> Array:

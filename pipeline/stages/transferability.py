@@ -3,6 +3,7 @@
 One job per imitator; what is done with the readings (which training counts, verdicts, weights) trains nothing again.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,7 @@ class TransferabilityStage(Weighting):
         cluster, reading = ClusterJob.of(run, job), run.config.transferability.reading
         imitator = Imitator.load(run.job_artifact(ImitatorsStage.name, job))
         readers, played = cluster.readers(run.config), self._episodes(run.config, cluster, imitator.policy)
-        divergences = readers.train(played, reading)
+        divergences = readers.train(played, reading, context.progress)
         return Reading(cluster.members, divergences, int((played.lengths - 1).sum()), readers.arrays()).files()
 
     def _episodes(self, config: RunConfig, cluster: ClusterJob, policy: GaussianPolicy) -> Demonstrations:
@@ -77,10 +78,10 @@ class TransferabilityStage(Weighting):
         """Take each cluster's closest imitator and turn its readings into scores, verdicts and weights."""
         demonstrations, section = load_demonstrations(run), run.config.transferability
         divergences = np.empty((section.reading.repetitions, len(demonstrations)))
-        history, env_steps = {}, 0
+        history, read_from, env_steps = {}, {}, 0
         for cluster, jobs in self._by_cluster(run).items():
             env_steps += sum(Reading.load(run.job_artifact(self.name, job)).env_steps for job in jobs)
-            job = self._closest(run, jobs)
+            job = read_from[cluster] = self._closest(run, jobs)
             reading = Reading.load(run.job_artifact(self.name, job))
             divergences[:, reading.demonstrations] = reading.divergences
             history[cluster] = ScoreHistory.load(run.job_artifact(ImitatorsStage.name, job))
@@ -88,7 +89,9 @@ class TransferabilityStage(Weighting):
         readings = self._readings(run.config, demonstrations, divergences)
         best = max(float(readings[:, labels == cluster].mean()) for cluster in history)
         threshold = section.kept_from * best
-        return self._judged(readings, labels, threshold, env_steps, history).files()
+        found = self._judged(readings, labels, threshold)
+        found.intervals[np.bincount(labels)[labels] == 1] = 0, 1  # Its readers have seen it, and there is no other.
+        return replace(found, env_steps=env_steps, read_from=read_from, history=history).files()
 
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
         """Return scores by the frozen clusters and readers, and weights among these demonstrations.
@@ -105,9 +108,9 @@ class TransferabilityStage(Weighting):
         labels, assignment, known = labeled.labels, load_assignment(run), load_demonstrations(run)
         unlike = ~np.isin(labels, assignment.labels)
         divergences = np.full((2 * run.config.transferability.reading.repetitions, len(demonstrations)), np.inf)
-        by_cluster = self._by_cluster(run)
-        for cluster in set(np.unique(labels).tolist()) & set(by_cluster):
-            job = self._closest(run, by_cluster[cluster])
+        read_from = self.load(run).read_from
+        for cluster in set(np.unique(labels).tolist()) & set(read_from):
+            job = read_from[cluster]
             reading = Reading.load(run.job_artifact(self.name, job))
             readers = ClusterJob.of(run, job).readers(run.config)
             readers.load(reading.readers)
@@ -118,7 +121,7 @@ class TransferabilityStage(Weighting):
             unlike[new] = around.unlike(chosen, labeled.features[new])
         readings = self._readings(run.config, demonstrations, divergences)
         readings[:, unlike] = np.nan
-        return self._judged(readings, labels, self.load(run).threshold, 0, {})
+        return self._judged(readings, labels, self.load(run).threshold)
 
     def _by_cluster(self, run: Run) -> dict[int, list[str]]:
         """Return the jobs of each cluster that has demonstrations."""
@@ -136,23 +139,9 @@ class TransferabilityStage(Weighting):
         horizon = environment_spec(environment.id, environment.dynamics).max_episode_steps
         return transferability_of_divergences(divergences) * share_lasted(demonstrations, horizon)
 
-    def _judged(
-        self,
-        readings: np.ndarray,
-        labels: np.ndarray,
-        threshold: float,
-        env_steps: int,
-        history: dict[int, ScoreHistory],
-    ) -> Transferability:
-        return Transferability(
-            scores=readings.mean(axis=0),
-            weights=kept_weights(readings, threshold),
-            clusters=labels,
-            intervals=intervals(readings),
-            threshold=threshold,
-            env_steps=env_steps,
-            history=history,
-        )
+    def _judged(self, readings: np.ndarray, labels: np.ndarray, threshold: float) -> Transferability:
+        weights = kept_weights(readings, threshold)
+        return Transferability(readings.mean(axis=0), weights, labels, intervals(readings), threshold)
 
 
 register(TransferabilityStage())
