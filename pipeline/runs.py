@@ -214,9 +214,9 @@ class RunResults:
         """Return the results known so far, as JSON values.
 
         ``policies`` by name: mean and std of the return, episodes, env_steps; ``weightings`` by name: see `separation`;
-        ``verdicts`` by name, of weightings that train imitators: see `VerdictTable`; ``purity``; ``reproducibility`` with the distance of each source in ``sources``, those that count as
-        ``reproducible`` and whether that is ``everything``; ``env_steps`` and ``seconds`` of all that was run. What is
-        not known is left out.
+        ``verdicts`` by name, of weightings that train imitators: see `VerdictTable`; ``purity``; ``reproducibility``
+        with the distance of each source in ``sources``, those that count as ``reproducible`` and whether that is
+        ``everything``; ``env_steps`` and ``seconds`` of all that was run. What is not known is left out.
         """
         policies, weightings, verdicts = {}, {}, {}
         for policy in self.policies:

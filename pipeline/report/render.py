@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from markupsafe import Markup
 
-from oodil.pipeline.report import figures, formats, summary
+from oodil.pipeline.report import figures, formats, looks, score_figures, summary
 from oodil.pipeline.report.figures import PolicyResult
 from oodil.pipeline.report.sources import Source, Sources
 from oodil.pipeline.report.summary import Card, Findings, Note
@@ -194,7 +194,7 @@ def _environment() -> jinja2.Environment:
     )
     environment.filters |= {each.__name__: each for each in (formats.plural, formats.returned, formats.percent)}
     environment.filters["steps"] = formats.count
-    environment.globals["training_colors"] = figures.TRAINING
+    environment.globals["training_colors"] = looks.TRAINING
     return environment
 
 
@@ -230,8 +230,8 @@ def _weighting(found: Findings, sources: Sources, name: str) -> WeightingSection
     return WeightingSection(
         title=found.title(name),
         rule=found.rule(name),
-        figure=figures.transferability(weighting.scores, sources.index, sources.looks),
-        convergence=figures.convergence(weighting, colors) if weighting.history else None,
+        figure=score_figures.transferability(weighting, sources.index, sources.looks),
+        convergence=score_figures.convergence(weighting, colors) if weighting.history else None,
     )
 
 

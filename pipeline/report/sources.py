@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from oodil.pipeline.algorithms.weights import sampling_mass
 from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.report.figures import Look, source_looks
+from oodil.pipeline.report.looks import Look, source_looks
 from oodil.pipeline.results import Transferability
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.stages.demonstrations import transferable_marks

@@ -20,7 +20,7 @@ from oodil.pipeline.loading import parse_config
 from oodil.pipeline.metrics import Metrics
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.report import Report, context, summary, write_report
-from oodil.pipeline.report.figures import MUTED, POLICIES, contrast, source_looks
+from oodil.pipeline.report.looks import MUTED, POLICIES, contrast, source_looks
 from oodil.pipeline.report.sources import Source, Sources, ranks_demonstrations
 from oodil.pipeline.report.summary import Findings
 from oodil.pipeline.report.trainings import read_trainings
