@@ -54,11 +54,12 @@ def _columns(
 ) -> None:
     """Draw a column for each of the (N,) groups, with a line at its mean and below it how many are kept."""
     present = sorted(np.unique(groups).tolist(), key=lambda group: -found.scores[groups == group].mean())
-    x, verdicts, kept = np.empty(len(groups)), found.verdicts, []
+    x, size, verdicts, kept = np.empty(len(groups)), np.empty(len(groups)), found.verdicts, []
     for column, group in enumerate(present):
         mine = np.flatnonzero(groups == group)
         ranked = mine[np.argsort(-found.scores[mine], kind="stable")]
         x[ranked] = column + 0.8 * ((np.arange(len(mine)) + 0.5) / len(mine) - 0.5)
+        size[mine] = np.clip(1000 / len(mine), 7, 36)
         mean = found.scores[mine].mean()
         axes.hlines(mean, column - 0.44, column + 0.44, color=INK, linewidth=1.2, zorder=2)
         name = f"{prefix}{group}\n" if prefix else ""
@@ -67,16 +68,23 @@ def _columns(
     axes.set_xticks(range(len(present)) if named else [], kept if named else [])
     axes.set_xlim(-0.55, len(present) - 0.45)
     axes.tick_params(axis="x", length=0)
-    size = float(np.clip(5000 / len(groups), 9, 40))
     bitmap = len(groups) > MOST_AS_VECTORS
     for i in largest_first(sources):
         for verdict, (alpha, filled) in FILLS.items():
             mine = (sources == i) & (verdicts == verdict)
             color, marker = looks[i].color, looks[i].marker
             low, high = found.intervals[mine].T
-            axes.vlines(x[mine], low, high, color=color, linewidth=0.8, alpha=0.35, rasterized=bitmap)
+            axes.vlines(
+                x[mine],
+                low,
+                high,
+                color=color,
+                linewidth=np.minimum(1.2, size[mine] / 20),
+                alpha=0.4,
+                rasterized=bitmap,
+            )
             axes.scatter(
-                x[mine], found.scores[mine], s=size, marker=marker, zorder=3, alpha=alpha, rasterized=bitmap,
+                x[mine], found.scores[mine], s=size[mine], marker=marker, zorder=3, alpha=alpha, rasterized=bitmap,
                 facecolors=color if filled else "white", edgecolors="white" if filled else color,
                 linewidths=0.35 if filled else 1.2,
             )  # fmt: skip
