@@ -1,5 +1,8 @@
 """How many clusters the embedding itself suggests, and where the run's clusters differ; sources play no part.
 
+One silhouette judges all groups at once, so that a cluster whose modes lie much closer together than clusters do counts
+as one. Silhouettes within each cluster would not do better: contrastive features fall apart in every cluster.
+
 Letters: N demonstrations, E embedding, K clusters, G groups that the embedding suggests.
 """
 

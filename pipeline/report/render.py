@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 from markupsafe import Markup
 
+from oodil.pipeline.algorithms.weights import effective_number
 from oodil.pipeline.report import figures, formats, looks, score_figures, summary
 from oodil.pipeline.report.policies import PolicySection, read_policies
 from oodil.pipeline.report.sources import Source, Sources
@@ -35,8 +36,8 @@ class WeightingSection:
     by_cluster: tuple[Verdicts, ...]
     threshold: float
     effective_number: float
-    powers: tuple[tuple[str, float], ...]
-    """Weights that could have been, and the transferable share that they would have given."""
+    alternatives: tuple[tuple[str, float, float], ...]
+    """Weights that could have been, the transferable share and the effective number that they would have given."""
     convergence: Markup | None
     """None for a weighting without trainings of its own."""
 
@@ -195,12 +196,6 @@ def _weighting(found: Findings, sources: Sources, name: str) -> WeightingSection
         most_frequent = int(np.bincount(sources.index[history.demonstrations]).argmax())
         colors[cluster] = sources.looks[most_frequent].color
     table = VerdictTable.of(weighting, sources.demonstrations)
-    shares = found.separation.get(name, {})
-    powers = [
-        ("without weights", "share_before"),
-        ("the rule", "share"),
-        *((f"score to the power of {power}" if power > 1 else "score", f"share_power_{power}") for power in POWERS),
-    ]
     return WeightingSection(
         title=found.title(name),
         meaning=MEANING if weighting.history else "",
@@ -209,10 +204,19 @@ def _weighting(found: Findings, sources: Sources, name: str) -> WeightingSection
         by_cluster=table.by_cluster,
         threshold=table.threshold,
         effective_number=table.effective_number,
-        powers=tuple((title, shares[key]) for title, key in powers if shares),
+        alternatives=_alternatives(weighting, found.separation.get(name, {})),
         figure=score_figures.transferability(weighting, sources.index, sources.looks),
         convergence=score_figures.convergence(weighting, colors) if weighting.history else None,
     )
+
+
+def _alternatives(weighting: Transferability, shares: dict[str, float]) -> tuple[tuple[str, float, float], ...]:
+    """Return what other weights would have given, of what `RunResults.separation` returns; nothing if it is empty."""
+    weights = {"none": ("share_before", np.ones(len(weighting.scores))), "the rule": ("share", weighting.weights)}
+    for power in POWERS:
+        title = "score" if power == 1 else f"score to the power of {power}"
+        weights[title] = (f"share_power_{power}", weighting.scores**power + 1e-300)
+    return tuple((title, shares[key], effective_number(each)) for title, (key, each) in weights.items() if shares)
 
 
 def _mixture(found: Findings, sources: Sources) -> Mixture:

@@ -120,7 +120,7 @@ def convergence(found: Transferability, colors: dict[int, str]) -> Markup:
             _score_axis(axes, highest, found.threshold)
             steps_axis(axes, 4)
         figure.supxlabel("environment steps of the cluster's imitator", fontsize=8.5, color=MUTED)
-        panels[0, 0].set_ylabel("transferability")
+        panels[0, 0].set_ylabel("2 (1 − D)")
     return Markup(svg.getvalue())
 
 
