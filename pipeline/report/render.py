@@ -215,7 +215,8 @@ def _alternatives(weighting: Transferability, shares: dict[str, float]) -> tuple
     weights = {"none": ("share_before", np.ones(len(weighting.scores))), "the rule": ("share", weighting.weights)}
     for power in POWERS:
         title = "score" if power == 1 else f"score to the power of {power}"
-        weights[title] = (f"share_power_{power}", weighting.scores**power + 1e-300)
+        raised = weighting.scores**power
+        weights[title] = (f"share_power_{power}", raised if raised.any() else np.ones(len(raised)))
     return tuple((title, shares[key], effective_number(each)) for title, (key, each) in weights.items() if shares)
 
 
