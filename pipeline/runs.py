@@ -24,11 +24,14 @@ from oodil.pipeline.results import (
     LearningCurve,
     Policy,
     Reproducibility,
+    Trainings,
     Transferability,
 )
 from oodil.pipeline.stage import Run, StageState, state_of
 from oodil.pipeline.stages import PolicyStage, Weighting, policies_of, stages, weightings_of
 from oodil.pipeline.stages.demonstrations import load_demonstrations, transferable_marks
+from oodil.pipeline.suggestion import Suggestion, suggest
+from oodil.pipeline.verdicts import VerdictTable
 
 POWERS = 1, 2, 4, 8
 """Of the scores, for comparison: what weights would have been without a rule of what is kept."""
@@ -127,6 +130,19 @@ class RunResults:
         """Return a policy's learning curve."""
         return LearningCurve.load(self.artifact(name))
 
+    def trainings(self, name: str = "imitation") -> Trainings:
+        """Return all trainings of a policy; the one that was kept is the first."""
+        return Trainings.load(self.artifact(name))
+
+    def verdicts(self, weighting: str = "transferability") -> VerdictTable:
+        """Return what a weighting says of each source, of each cluster and of all demonstrations."""
+        return VerdictTable.of(self.weighting(weighting), self.demonstrations)
+
+    @cached_property
+    def suggestion(self) -> Suggestion | None:
+        """How many clusters the embedding suggests; None where it tells too little apart."""
+        return suggest(self.assignment)
+
     def score(self, demonstrations: Demonstrations, weighting: str = "transferability") -> Transferability:
         """Return what a finished weighting says of other demonstrations; nothing is trained.
 
@@ -198,11 +214,11 @@ class RunResults:
         """Return the results known so far, as JSON values.
 
         ``policies`` by name: mean and std of the return, episodes, env_steps; ``weightings`` by name: see `separation`;
-        ``purity``; ``reproducibility`` with the distance of each source in ``sources``, those that count as
-        ``reproducible`` and whether that is ``everything``; ``env_steps`` and ``seconds`` of all that was run. What is
-        not known is left out.
+        ``verdicts`` by name, of weightings that train imitators: see `VerdictTable`; ``purity``; ``reproducibility``
+        with the distance of each source in ``sources``, those that count as ``reproducible`` and whether that is
+        ``everything``; ``env_steps`` and ``seconds`` of all that was run. What is not known is left out.
         """
-        policies, weightings = {}, {}
+        policies, weightings, verdicts = {}, {}, {}
         for policy in self.policies:
             if self.is_done(policy.name):
                 final = self.evaluation(policy.name)
@@ -215,6 +231,8 @@ class RunResults:
         for weighting in self.weightings:
             if self.is_done(weighting.name) and self.is_done("demonstrations"):
                 weightings[weighting.name] = self.separation(weighting.name)
+                if self.weighting(weighting.name).history:
+                    verdicts[weighting.name] = self.verdicts(weighting.name).describe()
         reproducibility: dict[str, Any] = {}
         if self.is_done("reproducibility") and self.is_done("demonstrations"):
             known = self.reproducibility
@@ -227,6 +245,7 @@ class RunResults:
         found: dict[str, Any] = {
             "policies": policies,
             "weightings": {name: figures for name, figures in weightings.items() if figures},
+            "verdicts": verdicts,
             "reproducibility": reproducibility,
             "purity": self.cluster_diagnostics.purity if self.is_done("clustering") else None,
             "env_steps": sum(self.env_steps().values()),

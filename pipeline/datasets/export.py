@@ -17,7 +17,7 @@ TARGETS = "FILE.csv (a new table), FILE.hdf5 (masks and attributes) or minari:DA
 
 
 def export(demonstrations: Demonstrations, columns: Mapping[str, NDArray[Any]], target: str) -> str:
-    """Write cluster, transferability and weight of (N,) demonstrations and return what was done.
+    """Write cluster, transferability with interval, verdict and weight of (N,) demonstrations and return what was done.
 
     Args:
         demonstrations: those of the run; an existing target must hold exactly these.

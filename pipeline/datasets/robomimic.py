@@ -61,7 +61,7 @@ def write_masks(path: Path, demonstrations: Demonstrations, columns: Mapping[str
             file[f"mask/{mask}"] = np.array(names[members], "S")
         for n, name in enumerate(names):
             for column, values in columns.items():
-                file[f"data/{name}"].attrs[f"oodil_{column}"] = values[n]
+                file[f"data/{name}"].attrs[f"oodil_{column}"] = values[n].item()
         return int(transferable.sum())
 
 

@@ -11,36 +11,15 @@ import numpy as np
 import yaml
 from markupsafe import Markup
 
-from oodil.pipeline.report import figures, formats, summary
-from oodil.pipeline.report.figures import PolicyResult
+from oodil.pipeline.algorithms.weights import effective_number
+from oodil.pipeline.report import figures, formats, looks, score_figures, summary
+from oodil.pipeline.report.policies import PolicySection, read_policies
 from oodil.pipeline.report.sources import Source, Sources
 from oodil.pipeline.report.summary import Card, Findings, Note
 from oodil.pipeline.report.trainings import read_trainings
 from oodil.pipeline.results import Assignment, ClusterDiagnostics, Transferability
-from oodil.pipeline.runs import RunResults
-
-
-@dataclass(frozen=True)
-class PolicyRow:
-    """A policy in the table of policies."""
-
-    title: str
-    weighting: str
-    """Title of the weighting it learns with; empty for none."""
-    mean_return: float | None
-    spread: str
-    episodes: int | None
-    env_steps: int | None
-
-
-@dataclass(frozen=True)
-class PolicySection:
-    """What the policies reach."""
-
-    figure: Markup | None
-    curve_episodes: tuple[int, ...]
-    """Different numbers of episodes per point of the curves."""
-    rows: tuple[PolicyRow, ...]
+from oodil.pipeline.runs import POWERS, RunResults
+from oodil.pipeline.verdicts import MEANING, Verdicts, VerdictTable
 
 
 @dataclass(frozen=True)
@@ -48,9 +27,17 @@ class WeightingSection:
     """What a weighting says of single demonstrations."""
 
     title: str
+    meaning: str
+    """What a score says; empty for a weighting without trainings of its own."""
     rule: str
     """How weights follow from scores."""
     figure: Markup
+    by_source: tuple[tuple[Source, Verdicts], ...]
+    by_cluster: tuple[Verdicts, ...]
+    threshold: float
+    effective_number: float
+    alternatives: tuple[tuple[str, float, float], ...]
+    """Weights that could have been, the transferable share and the effective number that they would have given."""
     convergence: Markup | None
     """None for a weighting without trainings of its own."""
 
@@ -79,6 +66,8 @@ class Mixture:
     bars: tuple[Bar, ...]
     columns: tuple[str, ...]
     rows: tuple[SourceRow, ...]
+    reproducibility: str
+    """Which sources the imitator's simulator can follow; empty where it was not tried."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +91,8 @@ class ClusterSection:
     mean_scores: tuple[tuple[str, tuple[str, ...]], ...]
     """Title of a weighting that scores within these clusters, and its mean score in each."""
     quality: tuple[str, ...]
+    suggestion: str
+    """How many clusters the embedding suggests; empty where it tells too little apart."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +157,7 @@ def context(results: RunResults) -> Report:
         finding=summary.finding(found),
         cards=tuple(summary.cards(found)),
         notes=tuple(summary.notes(found)),
-        policies=_policies(found),
+        policies=read_policies(found),
         weightings=tuple(_weighting(found, sources, name) for name in found.ranking) if sources else (),
         mixture=_mixture(found, sources) if sources and found.weightings else None,
         clusters=(
@@ -194,31 +185,8 @@ def _environment() -> jinja2.Environment:
     )
     environment.filters |= {each.__name__: each for each in (formats.plural, formats.returned, formats.percent)}
     environment.filters["steps"] = formats.count
-    environment.globals["training_colors"] = figures.TRAINING
+    environment.globals["training_colors"] = looks.TRAINING
     return environment
-
-
-def _policies(found: Findings) -> PolicySection | None:
-    results = found.results
-    if not found.finals:
-        return None
-    drawn, rows = [], []
-    for policy in results.policies:
-        final = found.finals.get(policy.name)
-        curve = results.curve(policy.name) if final else None
-        drawn.append(PolicyResult(policy.title, curve if curve and len(curve.env_steps) else None, final))
-        row = PolicyRow(
-            title=policy.title,
-            weighting=found.title(policy.weighting) if policy.weighting else "",
-            mean_return=final.mean_return if final else None,
-            spread=formats.spread(final.std_return, final.mean_return) if final else "",
-            episodes=len(final) if final else None,
-            env_steps=results.policy(policy.name).env_steps if final else None,
-        )
-        rows.append(row)
-    finite = any(each.final and np.isfinite(each.final.mean_return) for each in drawn)
-    episodes = sorted({each.curve.episodes for each in drawn if each.curve})
-    return PolicySection(figures.learning(drawn) if finite else None, tuple(episodes), tuple(rows))
 
 
 def _weighting(found: Findings, sources: Sources, name: str) -> WeightingSection:
@@ -227,12 +195,29 @@ def _weighting(found: Findings, sources: Sources, name: str) -> WeightingSection
     for cluster, history in weighting.history.items():
         most_frequent = int(np.bincount(sources.index[history.demonstrations]).argmax())
         colors[cluster] = sources.looks[most_frequent].color
+    table = VerdictTable.of(weighting, sources.demonstrations)
     return WeightingSection(
         title=found.title(name),
+        meaning=MEANING if weighting.history else "",
         rule=found.rule(name),
-        figure=figures.transferability(weighting.scores, sources.index, sources.looks),
-        convergence=figures.convergence(weighting, colors) if weighting.history else None,
+        by_source=tuple(zip((each for each in sources.each if each.count), table.by_source, strict=True)),
+        by_cluster=table.by_cluster,
+        threshold=table.threshold,
+        effective_number=table.effective_number,
+        alternatives=_alternatives(weighting, found.separation.get(name, {})),
+        figure=score_figures.transferability(weighting, sources.index, sources.looks),
+        convergence=score_figures.convergence(weighting, colors) if weighting.history else None,
     )
+
+
+def _alternatives(weighting: Transferability, shares: dict[str, float]) -> tuple[tuple[str, float, float], ...]:
+    """Return what other weights would have given, of what `RunResults.separation` returns; nothing if it is empty."""
+    weights = {"none": ("share_before", np.ones(len(weighting.scores))), "the rule": ("share", weighting.weights)}
+    for power in POWERS:
+        title = "score" if power == 1 else f"score to the power of {power}"
+        raised = weighting.scores**power
+        weights[title] = (f"share_power_{power}", raised if raised.any() else np.ones(len(raised)))
+    return tuple((title, shares[key], effective_number(each)) for title, (key, each) in weights.items() if shares)
 
 
 def _mixture(found: Findings, sources: Sources) -> Mixture:
@@ -247,18 +232,37 @@ def _mixture(found: Findings, sources: Sources) -> Mixture:
     for name, weighting in found.weightings.items():
         title = found.title(name)
         shares["weighted" if only else f"weighting “{title}”"] = own = sources.shares(weighting.weights)
-        if name in found.ranking:
-            columns.append("mean transferability" if only else f"mean transferability, {title}")
-            values.append([formats.decimal(mean) for mean in sources.means(weighting.scores)])
         columns.append("share, weighted" if only else f"share, {title}")
         values.append([formats.percent(share) for share in own])
+    told = ""
+    if found.results.is_done("reproducibility"):
+        known = found.results.reproducibility
+        distances = known.by_source(sources.demonstrations)
+        chosen = known.reproducible_sources(sources.demonstrations)
+        columns.append("can be reproduced (distance)")
+        values.append(
+            [
+                f"{'yes' if chosen[k] else 'no'} ({formats.decimal(distances[k])})"
+                for k in sources.demonstrations.source_labels
+            ]
+        )
+        told = reproducible(chosen)
     return Mixture(
+        reproducibility=told,
         bars=tuple(
             Bar(title, tuple(zip(sources.each, map(float, each), strict=True))) for title, each in shares.items()
         ),
         columns=tuple(columns),
         rows=tuple(map(SourceRow, sources.each, zip(*values, strict=True))),
     )
+
+
+def reproducible(sources: dict[str, bool]) -> str:
+    """Say of which sources, by label, the imitator's simulator can follow every step."""
+    if all(sources.values()):
+        return "Every source can be reproduced: the imitator's simulator can follow its demonstrations."
+    missing = ", ".join(label or "unnamed" for label, known in sources.items() if not known)
+    return f"The imitator's simulator cannot follow the demonstrations of: {missing}."
 
 
 def _clusters(
@@ -290,6 +294,7 @@ def _clusters(
             for name, weighting in found.weightings.items()
             if np.array_equal(weighting.clusters, assignment.labels)
         ),
+        suggestion=found.results.suggestion.text if found.results.suggestion else "",
         quality=tuple(
             f"{name} {formats.decimal(value, digits)}" for name, value, digits in quality if value is not None
         ),

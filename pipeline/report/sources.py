@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from oodil.pipeline.algorithms.weights import sampling_mass
 from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.report.figures import Look, source_looks
+from oodil.pipeline.report.looks import Look, source_looks
 from oodil.pipeline.results import Transferability
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.stages.demonstrations import transferable_marks
@@ -59,15 +59,8 @@ class Sources:
 
     def shares(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return each source's share of the transitions drawn under weights (N,)."""
-        return self._sums(sampling_mass(weights, self.demonstrations))
-
-    def means(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return each source's mean of values (N,); NaN for a source without demonstrations."""
-        counts = np.array([source.count for source in self.each], np.float64)
-        return self._sums(values) / np.where(counts > 0, counts, np.nan)
-
-    def _sums(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.bincount(self.index, values, minlength=len(self.each)).astype(np.float64)
+        mass = sampling_mass(weights, self.demonstrations)
+        return np.bincount(self.index, mass, minlength=len(self.each)).astype(np.float64)
 
 
 def read_sources(results: RunResults) -> Sources | None:

@@ -181,6 +181,9 @@ def notes(found: Findings) -> list[Note]:
                 "transferable demonstrations. The usual cause is a training that is too short."
             )
             told.append(Note(text))
+    for name, weighting in found.weightings.items():
+        if weighting.history:
+            told += [Note(text) for text in (results.verdicts(name).warning,) if text]
     if found.diagnostics and found.diagnostics.label_stability < UNSTABLE_LABELS:
         text = (
             f"The clusters are unstable: the label of a demonstration is that of only "

@@ -29,7 +29,7 @@ def read_trainings(results: RunResults) -> dict[str, list[Training]]:
             path = results.run.directory.metrics(stage.name, job)
             group, title = stage.name, job.replace("-", " ")
             if isinstance(stage, PolicyStage):
-                group, title = "policies", stage.title
+                group, title = "policies", f"{stage.title}, {title}"
             training = _read(path, title) if path.is_file() else None
             if training is not None:
                 found.setdefault(group, []).append(training)

@@ -337,7 +337,7 @@ def export_demos(
     run_dir: RunPath,
     target: Annotated[str, typer.Argument(help="FILE.csv, FILE.hdf5 (robomimic) or minari:DATASET_ID.")],
 ) -> None:
-    """Write cluster, transferability and weight of every demonstration to a table, or to where they came from."""
+    """Write cluster, score with interval, verdict and weight of every demonstration to a table, or to their origin."""
     from oodil.api import open_run
     from oodil.pipeline.datasets.export import export
 

@@ -17,6 +17,7 @@ from rich.table import Table
 
 from oodil.orchestrator import Observer
 from oodil.pipeline.runs import RunResults, shown_return
+from oodil.pipeline.verdicts import MEANING, VerdictTable
 from oodil.workers.reports import DONE, AttemptFailed, Event, Finished, Replaced, Started, Warn
 from oodil.workers.reports import Progress as JobProgress
 
@@ -155,6 +156,7 @@ def print_summary(results: RunResults, report: Path) -> None:
         table.add_row(label, figure)
     console.print()
     console.print(table)
+    _print_verdicts(console, results)
     console.print(f"\nreport: {report}", highlight=False, soft_wrap=True)
 
 
@@ -195,6 +197,44 @@ def print_status(results: RunResults) -> None:
     console.print(table)
     for label, figure in _summary_rows(results):
         console.print(f"  {label}: {figure}", highlight=False)
+    _print_verdicts(console, results)
+
+
+def _print_verdicts(console: Console, results: RunResults) -> None:
+    """Print what every weighting that trains imitators says of each source and each cluster."""
+    for weighting in results.weightings:
+        usable = results.is_done(weighting.name) and results.is_done("demonstrations")
+        if not usable or not results.weighting(weighting.name).history:
+            continue
+        found = results.verdicts(weighting.name)
+        console.print(f"\nTransferability ({escape(weighting.title)}). {MEANING}.", highlight=False)
+        console.print(_verdict_table(found))
+        told = (
+            f"Kept: the whole interval reaches {found.threshold:.3f}; open: a part of it does. Drawn: share of the "
+            "transitions that are drawn, before and after weighting; it is as even as that of "
+            f"{found.effective_number:.0f} equal demonstrations."
+        )
+        console.print(told, highlight=False)
+        if found.warning:
+            console.print(f"[yellow]{escape(found.warning)}[/]", highlight=False)
+    if results.is_done("clustering") and results.suggestion:
+        used = results.cluster_diagnostics.non_empty_clusters
+        console.print(f"Clusters in use: {used}. {results.suggestion.text}", highlight=False)
+
+
+def _verdict_table(found: VerdictTable) -> Table:
+    table = Table(box=None, padding=(0, 1), pad_edge=False)
+    table.add_column("source", max_width=20, overflow="ellipsis", no_wrap=True)
+    for name in ("n", "kept", "open", "score and interval", "drawn"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for title, rows in (("", found.by_source), ("[bold]cluster[/]", found.by_cluster)):
+        if title:
+            table.add_row(title)
+        for row in rows:
+            counts = (str(each) for each in (row.demonstrations, row.kept, row.open))
+            score = f"{row.score:.3f} [{row.low:.3f}, {row.high:.3f}]"
+            table.add_row(escape(row.name), *counts, escape(score), f"{row.share_before:.1%} -> {row.share:.1%}")
+    return table
 
 
 def print_demonstrations(path: Path, demonstrations: "Demonstrations", environment: str) -> None:
