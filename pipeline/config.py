@@ -288,6 +288,10 @@ class ReadingConfig(_Section):
 
     steps: PositiveInt = 600
     """Steps of each discriminator."""
+    learning_rate: PositiveFloat = 3e-3
+    """Adam's step size."""
+    gradient_penalty: float = Field(default=3.0, ge=0.0)
+    """Weight of half the squared gradient, as in training; a flatter judge tells broad differences from small ones."""
     batch_size: PositiveInt = 512
     """Transitions from either side in a step."""
     repetitions: PositiveInt = 4

@@ -27,14 +27,17 @@ class Readers:
     """Discriminators between demonstrations and an imitator's episodes, each trained on half of both."""
 
     def __init__(
-        self, demonstrations: Demonstrations, config: DiscriminatorConfig, repetitions: int, seed: int
+        self, demonstrations: Demonstrations, discriminator: DiscriminatorConfig, config: ReadingConfig, seed: int
     ) -> None:
         """Draw the untrained discriminators of demonstrations that all count the same."""
+        self._config = config
         self._demonstrations = demonstrations
         self._seed = seed
         weights = np.ones(len(demonstrations))
-        seeds = [torch_seed(derive_key(seed, "reading", "initial", d)) for d in range(2 * repetitions)]
-        self._nets = [Discriminator(demonstrations, weights, config, each) for each in seeds]
+        seeds = [torch_seed(derive_key(seed, "reading", "initial", d)) for d in range(2 * config.repetitions)]
+        update = {"learning_rate": config.learning_rate, "gradient_penalty": config.gradient_penalty}
+        judge = discriminator.model_copy(update=update)
+        self._nets = [Discriminator(demonstrations, weights, judge, each) for each in seeds]
         self.view = self._nets[0]
         """Any of them: all see transitions in the same way."""
         self._references = np.zeros(len(self._nets))
@@ -43,7 +46,6 @@ class Readers:
     def train(
         self,
         episodes: Demonstrations,
-        config: ReadingConfig,
         progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> Array:
         """Train all of them, and return the (R, N) divergences of the demonstrations, none read by one that saw it.
@@ -58,8 +60,9 @@ class Readers:
             half_shown, half_played = (each.half(halves) == bool(side) for each in (shown, played))
             rng = numpy_rng(derive_key(self._seed, "reading", "batches", d))
             ours, theirs = shown.rows(half_shown), played.rows(half_played)
-            for _ in range(config.steps):
-                net.update(shown.draw(ours, config.batch_size, rng), played.draw(theirs, config.batch_size, rng))
+            size = self._config.batch_size
+            for _ in range(self._config.steps):
+                net.update(shown.draw(ours, size, rng), played.draw(theirs, size, rng))
             self._references[d] = played.mean_logits(net)[~half_played].mean()
             unseen = ~half_shown if len(half_shown) > 1 else np.array([True])
             found[r, unseen] = shown.mean_logits(net)[unseen] - self._references[d]

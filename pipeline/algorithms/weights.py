@@ -31,13 +31,16 @@ def share_lasted(demonstrations: Demonstrations, horizon: int) -> Array:
     return np.where(demonstrations.terminated, lasted, 1.0)
 
 
-def kept_weights(readings: Array, threshold: float) -> Array:
-    """Return (N,) weights that sum to one: the mean score, times the share of readings that reach the threshold.
+def kept_weights(scores: Array, intervals: Array, threshold: float) -> Array:
+    """Return (N,) weights that sum to one: the scores of those whose whole interval (N, 2) reaches the threshold.
 
-    ``readings`` are (R, N) scores, NaN where there is none. Weights are uniform when no reading reaches it.
+    If there is none, those count whose interval holds it; if there is no such either, all count the same.
     """
-    weights = np.nan_to_num(readings.mean(axis=0)) * (readings >= threshold).mean(axis=0)
-    return np.asarray(weights / weights.sum()) if weights.sum() > 0 else np.full(len(weights), 1 / len(weights))
+    for limit in intervals.T:
+        weights = np.where(limit >= threshold, np.nan_to_num(scores), 0.0)
+        if weights.sum() > 0:
+            return np.asarray(weights / weights.sum())
+    return np.full(len(scores), 1 / len(scores))
 
 
 def intervals(readings: Array) -> Array:

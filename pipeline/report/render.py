@@ -237,13 +237,12 @@ def _mixture(found: Findings, sources: Sources) -> Mixture:
     told = ""
     if found.results.is_done("reproducibility"):
         known = found.results.reproducibility
-        distances = known.by_source(sources.demonstrations)
         chosen = known.reproducible_sources(sources.demonstrations)
         columns.append("can be reproduced (distance)")
         values.append(
             [
-                f"{'yes' if chosen[k] else 'no'} ({formats.decimal(distances[k])})"
-                for k in sources.demonstrations.source_labels
+                f"{'yes' if chosen[label] else 'no'} ({distance:.3f})" if np.isfinite(distance) else "not known"
+                for label, distance in known.by_source(sources.demonstrations).items()
             ]
         )
         told = reproducible(chosen)

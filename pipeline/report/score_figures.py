@@ -12,8 +12,10 @@ from oodil.pipeline.report.canvas import MOST_AS_VECTORS, drawing, largest_first
 from oodil.pipeline.report.looks import INK, MUTED, Look
 from oodil.pipeline.results import Transferability
 
-MOST_NAMED = 12
-"""With more columns, there is no room for their counts."""
+MOST_COUNTED, MOST_NAMED = 11, 30
+"""With more columns in all, there is no room for their counts, and then none for the numbers of clusters."""
+LEAST_SIZE = 22
+"""Of a mark that is kept or open: in a crowded column, few of them would be lost."""
 FILLS = {"not kept": (0.35, True), "open": (1.0, False), "kept": (1.0, True)}
 """By verdict, how opaque a mark is and whether it is filled; in the order of drawing."""
 
@@ -31,7 +33,7 @@ def transferability(found: Transferability, sources: NDArray[np.int32], looks: l
         panels = figure.subplots(1, len(groupings), sharey=True, squeeze=False, width_ratios=columns)[0]
         for axes, (title, prefix, groups) in zip(panels, groupings, strict=True):
             axes.set_title(title)
-            _columns(axes, found, groups, prefix, sources, looks)
+            _columns(axes, found, groups, prefix, sources, looks, sum(columns))
         top = max(float(found.intervals.max()), float(found.scores.max()))
         _score_axis(panels[0], top, found.threshold)
         for axes in panels[1:]:
@@ -39,6 +41,7 @@ def transferability(found: Transferability, sources: NDArray[np.int32], looks: l
         panels[-1].annotate(
             f"kept from {found.threshold:.3f}", (1.0, found.threshold), xytext=(0, 3), textcoords="offset points",
             xycoords=panels[-1].get_yaxis_transform(), ha="right", va="bottom", fontsize=8, color=INK,
+            bbox={"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 1}, zorder=4,
         )  # fmt: skip
         panels[0].set_ylabel("transferability")
     return Markup(svg.getvalue())
@@ -51,10 +54,14 @@ def _columns(
     prefix: str,
     sources: NDArray[np.int32],
     looks: list[Look],
+    total: int,
 ) -> None:
-    """Draw a column for each of the (N,) groups, with a line at its mean and below it how many are kept."""
+    """Draw a column for each of the (N,) groups, with a line at its mean and below it how many are kept.
+
+    ``total`` is the number of columns in all panels.
+    """
     present = sorted(np.unique(groups).tolist(), key=lambda group: -found.scores[groups == group].mean())
-    x, size, verdicts, kept = np.empty(len(groups)), np.empty(len(groups)), found.verdicts, []
+    x, size, verdicts, below = np.empty(len(groups)), np.empty(len(groups)), found.verdicts, []
     for column, group in enumerate(present):
         mine = np.flatnonzero(groups == group)
         ranked = mine[np.argsort(-found.scores[mine], kind="stable")]
@@ -63,11 +70,13 @@ def _columns(
         mean = found.scores[mine].mean()
         axes.hlines(mean, column - 0.44, column + 0.44, color=INK, linewidth=1.2, zorder=2)
         name = f"{prefix}{group}\n" if prefix else ""
-        kept.append(f"{name}{(verdicts[mine] == 'kept').sum()} of {len(mine)} kept")
-    named = len(present) <= MOST_NAMED
-    axes.set_xticks(range(len(present)) if named else [], kept if named else [])
+        count = f"{name}{(verdicts[mine] == 'kept').sum()} of {len(mine)} kept"
+        below.append(count if total <= MOST_COUNTED else str(group) if prefix and total <= MOST_NAMED else "")
+    axes.set_xticks(range(len(present)), below)
     axes.set_xlim(-0.55, len(present) - 0.45)
     axes.tick_params(axis="x", length=0)
+    lines = np.minimum(1.2, size / 20)
+    size[verdicts != "not kept"] = np.maximum(size[verdicts != "not kept"], LEAST_SIZE)
     bitmap = len(groups) > MOST_AS_VECTORS
     for i in largest_first(sources):
         for verdict, (alpha, filled) in FILLS.items():
@@ -79,7 +88,7 @@ def _columns(
                 low,
                 high,
                 color=color,
-                linewidth=np.minimum(1.2, size[mine] / 20),
+                linewidth=lines[mine],
                 alpha=0.4,
                 rasterized=bitmap,
             )
@@ -126,7 +135,7 @@ def convergence(found: Transferability, colors: dict[int, str]) -> Markup:
 
 def _score_axis(axes: Axes, highest: float, threshold: float) -> None:
     """Let the axis end at what there is: scores far below 1 would lie at the bottom of an empty plane."""
-    axes.set_ylim(0, min(1.02, 1.1 * max(highest, threshold)))
+    axes.set_ylim(0, min(1.02, 1.1 * max(highest, threshold)) or 1)
     _threshold(axes, threshold)
 
 

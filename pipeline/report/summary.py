@@ -187,7 +187,8 @@ def notes(found: Findings) -> list[Note]:
     if found.diagnostics and found.diagnostics.label_stability < UNSTABLE_LABELS:
         text = (
             f"The clusters are unstable: the label of a demonstration is that of only "
-            f"{formats.percent(found.diagnostics.label_stability)} of its sub-trajectories."
+            f"{formats.percent(found.diagnostics.label_stability)} of its sub-trajectories. Clusters may "
+            "split one mode; fewer of them may do."
         )
         told.append(Note(text))
     return told

@@ -66,7 +66,7 @@ class ClusterJob:
         from oodil.pipeline.algorithms.reading import Readers
 
         section = config.transferability
-        return Readers(self.demonstrations, section.gail.discriminator, section.reading.repetitions, self.seed)
+        return Readers(self.demonstrations, section.gail.discriminator, section.reading, self.seed)
 
 
 class ImitatorsStage(Stage):

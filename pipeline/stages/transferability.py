@@ -51,10 +51,7 @@ class TransferabilityStage(Weighting):
     def rule(self, config: RunConfig) -> str:
         """Say what is kept."""
         share = config.transferability.kept_from
-        return (
-            "a demonstration is drawn for imitation in proportion to its score, times the share of its readings that "
-            f"reach {share:.0%} of the best cluster's score"
-        )
+        return f"{super().rule(config)}, if the whole interval reaches {share:.0%} of the best cluster's score"
 
     def jobs(self, run: Run) -> list[str]:
         """Return one job per imitator, under its name."""
@@ -62,10 +59,10 @@ class TransferabilityStage(Weighting):
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Read the demonstrations of a cluster against fresh episodes of its imitator."""
-        cluster, reading = ClusterJob.of(run, job), run.config.transferability.reading
+        cluster = ClusterJob.of(run, job)
         imitator = Imitator.load(run.job_artifact(ImitatorsStage.name, job))
         readers, played = cluster.readers(run.config), self._episodes(run.config, cluster, imitator.policy)
-        divergences = readers.train(played, reading, context.progress)
+        divergences = readers.train(played, context.progress)
         return Reading(cluster.members, divergences, int((played.lengths - 1).sum()), readers.arrays()).files()
 
     def _episodes(self, config: RunConfig, cluster: ClusterJob, policy: GaussianPolicy) -> Demonstrations:
@@ -140,8 +137,8 @@ class TransferabilityStage(Weighting):
         return transferability_of_divergences(divergences) * share_lasted(demonstrations, horizon)
 
     def _judged(self, readings: np.ndarray, labels: np.ndarray, threshold: float) -> Transferability:
-        weights = kept_weights(readings, threshold)
-        return Transferability(readings.mean(axis=0), weights, labels, intervals(readings), threshold)
+        scores, limits = readings.mean(axis=0), intervals(readings)
+        return Transferability(scores, kept_weights(scores, limits, threshold), labels, limits, threshold)
 
 
 register(TransferabilityStage())

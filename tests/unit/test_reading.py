@@ -20,7 +20,7 @@ def walks(count, seed, drift=0.0, length=60):
 
 
 def readers(demonstrations, config=QUICK, seed=0):
-    return Readers(demonstrations, DiscriminatorConfig(), config.repetitions, seed)
+    return Readers(demonstrations, DiscriminatorConfig(), config, seed)
 
 
 def test_no_demonstration_is_read_by_a_discriminator_that_was_trained_on_it(monkeypatch):
@@ -34,7 +34,7 @@ def test_no_demonstration_is_read_by_a_discriminator_that_was_trained_on_it(monk
 
     monkeypatch.setattr(Discriminator, "update", spy)
     several = readers(demonstrations)
-    found = several.train(walks(6, 1).__class__.of([Episode(np.zeros((5, 1)))] * 6, "still"), QUICK)
+    found = several.train(walks(6, 1).__class__.of([Episode(np.zeros((5, 1)))] * 6, "still"))
     again = several.divergences(demonstrations)
     for d, trained_on in enumerate(seen.values()):
         assert 4 <= len(trained_on) <= 5
@@ -44,8 +44,8 @@ def test_no_demonstration_is_read_by_a_discriminator_that_was_trained_on_it(monk
 
 def test_the_same_reads_one_and_what_differs_in_its_changes_alone_reads_less():
     shown = walks(20, 0)
-    same = transferability_of_divergences(readers(shown).train(walks(20, 1), QUICK))
-    other = transferability_of_divergences(readers(shown).train(walks(20, 1, drift=2.0), QUICK))
+    same = transferability_of_divergences(readers(shown).train(walks(20, 1)))
+    other = transferability_of_divergences(readers(shown).train(walks(20, 1, drift=2.0)))
     assert same.mean() > 0.85
     assert other.max() < 0.4
 
@@ -53,7 +53,7 @@ def test_the_same_reads_one_and_what_differs_in_its_changes_alone_reads_less():
 def test_frozen_readers_say_it_again_and_so_do_those_of_the_same_seed(assert_same_bits):
     shown, played = walks(6, 0), walks(8, 1, drift=0.5)
     one, two, loaded = (readers(shown) for _ in range(3))
-    assert_same_bits(one.train(played, QUICK), two.train(played, QUICK))
+    assert_same_bits(one.train(played), two.train(played))
     loaded.load(one.arrays())
     fresh = walks(3, 5)
     assert_same_bits(one.divergences(fresh), loaded.divergences(fresh))
@@ -61,7 +61,7 @@ def test_frozen_readers_say_it_again_and_so_do_those_of_the_same_seed(assert_sam
 
 def test_one_demonstration_is_read_by_those_that_have_seen_it():
     alone = walks(1, 0)
-    found = readers(alone).train(walks(8, 1), QUICK)
+    found = readers(alone).train(walks(8, 1))
     assert found.shape == (2, 1)
     assert np.isfinite(found).all()
 
@@ -69,6 +69,6 @@ def test_one_demonstration_is_read_by_those_that_have_seen_it():
 @pytest.mark.parametrize("repetitions", [1, 3])
 def test_each_repetition_draws_other_halves(repetitions):
     config = QUICK.model_copy(update={"repetitions": repetitions, "steps": 20})
-    found = readers(walks(6, 0), config).train(walks(8, 1), config)
+    found = readers(walks(6, 0), config).train(walks(8, 1))
     assert found.shape == (repetitions, 6)
     assert len(np.unique(found[:, 0])) == repetitions

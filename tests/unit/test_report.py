@@ -21,13 +21,11 @@ from oodil.pipeline.report.looks import MUTED, POLICIES, contrast, source_looks
 from oodil.pipeline.report.sources import Source, Sources, ranks_demonstrations
 from oodil.pipeline.report.summary import Findings
 from oodil.pipeline.report.trainings import read_trainings
-from oodil.pipeline.results import (
-    Transferability,
-)
+from oodil.pipeline.results import Reproducibility, ScoreHistory, Transferability
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.stage import JobContext, Run, register
 from oodil.pipeline.stages import PolicyStage, Weighting
-from tests.synthetic import SMALL, Writer, exact, full_run, new_run
+from tests.synthetic import PAPER, SMALL, Writer, exact, full_run, new_run
 
 VOID = {"area", "base", "br", "col", "embed", "hr", "img", "input", "link", "meta", "source", "track", "wbr"}
 
@@ -152,6 +150,7 @@ def test_weightings_that_repeat_what_is_known_have_no_figure_of_their_own(full: 
     assert [weighting.title for weighting in report.weightings] == ["ours"]
     assert report.mixture is not None
     assert [bar.title for bar in report.mixture.bars] == ["unweighted", "weighting “ours”", "weighting “marks”"]
+    assert report.mixture.reproducibility == ""  # it was not asked for
     assert sum(share for source, share in report.mixture.bars[2].shares if source.transferable) == pytest.approx(1)
     assert report.policies is not None
     assert [(row.title, row.weighting) for row in report.policies.rows] == [
@@ -159,6 +158,86 @@ def test_weightings_that_repeat_what_is_known_have_no_figure_of_their_own(full: 
         ("naive GAIL", ""),
         ("oracle", "marks"),
     ]
+
+
+def test_verdicts_and_other_weights_are_on_the_page(full: tuple[Run, Page]) -> None:
+    run, page = full
+    section = contents(run).weightings[0]
+    found, separation = RunResults(run).verdicts(), RunResults(run).separation()
+    assert [(source.label, row.name) for source, row in section.by_source] == [(label, label) for label in PAPER]
+    assert tuple(row for _, row in section.by_source) == found.by_source
+    assert section.by_cluster == found.by_cluster
+    assert {title: share for title, share, _ in section.alternatives} == {
+        "none": separation["share_before"],
+        "the rule": separation["share"],
+        "score": separation["share_power_1"],
+        "score to the power of 2": separation["share_power_2"],
+        "score to the power of 4": separation["share_power_4"],
+        "score to the power of 8": separation["share_power_8"],
+    }
+    assert section.alternatives[0][2] == pytest.approx(520)
+    assert section.alternatives[1][2] == pytest.approx(found.effective_number)
+    for text in (
+        "cannot be told from the imitator's own fresh episodes",
+        "The rule of weights: a demonstration is drawn for imitation in proportion to its score, times",
+        "reaches 0.200, the dashed line",
+        "kept from 0.200",
+        "Diamond: the score",
+        f"{found.by_source[0].kept} of 10 kept",
+    ):
+        assert text in " ".join(page.text.split()), text
+
+
+def test_the_trainings_of_a_policy_begin_with_the_one_that_was_kept(full: tuple[Run, Page]) -> None:
+    policies = contents(full[0]).policies
+    assert policies is not None
+    assert [(row.policy, row.name, row.kept, row.distance) for row in policies.trainings[:2]] == [
+        ("ours", "training 2", True, "0.200"),
+        ("ours", "training 1", False, "0.300"),
+    ]
+    assert policies.trainings[1].mean_return == pytest.approx(2 * 2951.4)
+    assert "The trainings of each policy" in full[1].text
+
+
+def test_the_embedding_suggests_a_number_of_clusters(full: tuple[Run, Page]) -> None:
+    clusters = contents(full[0]).clusters
+    assert clusters is not None
+    assert clusters.suggestion.startswith("K suggested by the embedding: ")
+    assert clusters.suggestion in full[1].text
+
+
+@pytest.mark.parametrize(
+    ("light", "told"),
+    [
+        (0.01, "Every source can be reproduced"),
+        (0.2, "cannot follow the demonstrations of: light."),
+        (np.nan, "cannot follow the demonstrations of: light."),
+    ],
+)
+def test_what_can_be_reproduced_is_said(tmp_path: Path, light: float, told: str) -> None:
+    run = new_run(tmp_path, SMALL["marks"], SMALL["counts"], reproducibility={})
+    writer = Writer(run, 2)
+    writer.demonstrations()
+    distances = np.where(writer.sources == 0, 0.012, light)[:, None].repeat(4, axis=1)
+    writer.write("reproducibility", Reproducibility(distances, distances).files())
+    for name in ("clustering", "imitators", "transferability"):
+        writer.steps()[name]()
+    mixture, page = contents(run).mixture, render(run)
+    assert mixture is not None and told in mixture.reproducibility and told in page.text
+    assert mixture.columns[-1] == "can be reproduced (distance)"
+    assert mixture.rows[0].cells[-1] == "yes (0.012)"
+    expected = "yes (0.010)" if light == 0.01 else "no (0.200)" if light == 0.2 else "not known"
+    assert mixture.rows[1].cells[-1] == expected
+
+
+def test_scores_may_all_be_the_same(tmp_path: Path) -> None:
+    run = full_run(tmp_path, **SMALL)
+    writer, zeros = Writer(run, 2), np.zeros(8)
+    history = {0: ScoreHistory(np.arange(8), np.array([0, 1]), np.full((2, 8), np.inf))}
+    found = Transferability(zeros, np.full(8, 1 / 8), writer.labels, np.zeros((8, 2)), 0.0, 0, history)
+    writer.write("transferability", found.files())
+    assert "mean score of only 0.000" in notes(run)
+    render(run)
 
 
 class LengthWeighting(Weighting):

@@ -44,10 +44,12 @@ def test_a_failure_counts_for_the_part_of_the_horizon_that_it_lasted(demonstrati
     np.testing.assert_allclose(share_lasted(made, 20), [0.25, 1, 1, 1])
 
 
-def test_weights_are_scores_times_the_share_of_readings_that_reach_the_threshold():
-    readings = np.array([[0.8, 0.5, 0.1], [0.4, 0.3, 0.2]])
-    np.testing.assert_allclose(kept_weights(readings, 0.4), [0.6 / 0.8, 0.2 / 0.8, 0])
-    np.testing.assert_allclose(kept_weights(readings, 0.9), [1 / 3] * 3)
+def test_weights_are_the_scores_of_what_surely_reaches_the_threshold():
+    scores, limits = np.array([0.6, 0.2, 0.5, np.nan]), np.array([[0.5, 0.7], [0.1, 0.3], [0.3, 0.7], [np.nan] * 2])
+    np.testing.assert_allclose(kept_weights(scores, limits, 0.3), [0.6 / 1.1, 0, 0.5 / 1.1, 0])
+    np.testing.assert_allclose(kept_weights(scores, limits, 0.4), [1, 0, 0, 0])
+    np.testing.assert_allclose(kept_weights(scores, limits, 0.6), [0.6 / 1.1, 0, 0.5 / 1.1, 0], err_msg="all open")
+    np.testing.assert_allclose(kept_weights(scores, limits, 0.9), [0.25] * 4)
 
 
 def test_an_interval_is_two_deviations_around_the_mean_and_everything_with_one_reading():
