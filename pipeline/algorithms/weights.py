@@ -44,8 +44,10 @@ def kept_weights(scores: Array, intervals: Array, threshold: float) -> Array:
 
 
 def intervals(readings: Array) -> Array:
-    """Return (N, 2) intervals of (R, N) scores: two standard deviations around the mean; [0, 1] with one reading."""
-    spread = 2 * readings.std(axis=0, ddof=1) if len(readings) > 1 else np.ones(readings.shape[1])
+    """Return (N, 2) intervals of (R, N) scores: two standard errors around the mean; [0, 1] with one reading."""
+    spread = (
+        2 * readings.std(axis=0, ddof=1) / len(readings) ** 0.5 if len(readings) > 1 else np.ones(readings.shape[1])
+    )
     middle = readings.mean(axis=0)
     return np.clip(np.stack((middle - spread, middle + spread), axis=1), 0, 1)
 

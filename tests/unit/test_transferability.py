@@ -52,9 +52,9 @@ def test_weights_are_the_scores_of_what_surely_reaches_the_threshold():
     np.testing.assert_allclose(kept_weights(scores, limits, 0.9), [0.25] * 4)
 
 
-def test_an_interval_is_two_deviations_around_the_mean_and_everything_with_one_reading():
+def test_an_interval_is_two_errors_around_the_mean_and_everything_with_one_reading():
     readings = np.array([[0.5, 0.9, 0.0], [0.3, 0.9, 0.1]])
-    spread = 2 * np.sqrt(0.02)
+    spread = 2 * np.sqrt(0.02 / 2)
     expected = [[0.4 - spread, 0.4 + spread], [0.9, 0.9], [0, 0.05 + spread / 2]]
     np.testing.assert_allclose(intervals(readings), expected)
     np.testing.assert_allclose(intervals(readings[:1]), [[0, 1]] * 3)
