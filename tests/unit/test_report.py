@@ -179,7 +179,7 @@ def test_verdicts_and_other_weights_are_on_the_page(full: tuple[Run, Page]) -> N
     assert section.alternatives[1][2] == pytest.approx(found.effective_number)
     for text in (
         "cannot be told from the imitator's own fresh episodes",
-        "The rule of weights: a demonstration is drawn for imitation in proportion to its score, times",
+        "The rule of weights: a demonstration is drawn for imitation in proportion to its score, if the whole",
         "reaches 0.200, the dashed line",
         "kept from 0.200",
         "Diamond: the score",
@@ -234,7 +234,7 @@ def test_scores_may_all_be_the_same(tmp_path: Path) -> None:
     run = full_run(tmp_path, **SMALL)
     writer, zeros = Writer(run, 2), np.zeros(8)
     history = {0: ScoreHistory(np.arange(8), np.array([0, 1]), np.full((2, 8), np.inf))}
-    found = Transferability(zeros, np.full(8, 1 / 8), writer.labels, np.zeros((8, 2)), 0.0, 0, history)
+    found = Transferability(zeros, np.full(8, 1 / 8), writer.labels, np.zeros((8, 2)), 0.0, history=history)
     writer.write("transferability", found.files())
     assert "mean score of only 0.000" in notes(run)
     render(run)
