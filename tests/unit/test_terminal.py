@@ -19,7 +19,7 @@ def score(run: Run, scores: float) -> None:
     values, members = np.full(count, scores), np.arange(count)
     history = {0: ScoreHistory(members, np.array([0, 1]), np.zeros((2, count)))}
     band = np.stack((values - 0.01, values + 0.01), axis=1)
-    found = Transferability(values, values / values.sum(), writer.labels, band, 0.5 * scores, 0, history)
+    found = Transferability(values, values / values.sum(), writer.labels, band, 0.5 * scores, history=history)
     writer.write("transferability", found.files())
 
 
