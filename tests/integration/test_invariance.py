@@ -36,12 +36,12 @@ def test_a_finished_run_is_reused_and_a_changed_field_recomputes_what_follows(in
     before = artifacts(inline)
     output = run("run", str(MICRO), NAIVE, "--run-dir", str(inline), "--workers", "0")
     assert output.count("reused") == len(before)
-    changed = ("run", str(MICRO), NAIVE, "transferability.sharpening=1", "--run-dir", str(inline), "--workers", "0")
+    changed = ("run", str(MICRO), NAIVE, "transferability.kept_from=0.25", "--run-dir", str(inline), "--workers", "0")
     code, output = LiveRun(*changed).finish()
-    assert code == 2 and "finished with other settings (sharpening 4.0 -> 1.0); --force transferability" in output
+    assert code == 2 and "finished with other settings (kept_from 0.5 -> 0.25); --force transferability" in output
     assert artifacts(inline) == before, "nothing is replaced unasked, and the folder keeps its configuration"
     output = run(*changed, "--force", "transferability")
-    assert "imitators: reused" in output and "transferability: recomputed: sharpening 4.0 -> 1.0" in output
+    assert "imitators: reused" in output and "transferability: recomputed: kept_from 0.5 -> 0.25" in output
     assert "imitation: recomputed: its input transferability changed" in output
     assert "clustering: reused" in output and "naive_gail: reused" in output
     run("run", str(MICRO), NAIVE, "--run-dir", str(inline), "--workers", "0", "--force", "transferability")
