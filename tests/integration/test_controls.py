@@ -1,5 +1,5 @@
-"""Two controls of the transferability itself, with real training in other dynamics than the demonstrators': what no
-physics can do comes out far below what an expert did, and a robot that does nothing and falls gets next to no weight."""
+"""Two controls of the transferability itself, with real training in a gravity that is not the demonstrators': what no
+physics can do comes out far below what an expert did, and a robot that does nothing and falls weighs next to nothing."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from oodil.orchestrator import execute
-from oodil.pipeline.algorithms.weights import sampling_mass
 from oodil.pipeline.artifacts import RunDirectory, write_artifact
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.datasets import encode_demonstrations
