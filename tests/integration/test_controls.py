@@ -87,3 +87,22 @@ def weighted(path: Path, seed: int, budget: int = BUDGET) -> tuple[Demonstration
 def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Demonstrations, Transferability]:
     """The demonstrations and what one run says of them."""
     return weighted(tmp_path_factory.mktemp("controls") / "seed-0", seed=0)
+
+
+def test_what_is_read_backwards_is_told_from_what_was_done(found: tuple[Demonstrations, Transferability]) -> None:
+    """Same cluster, same states, same imitator; only the order of the states is against all dynamics."""
+    scores = found[1].scores
+    assert scores[REVERSED].mean() <= scores[GENUINE].mean() / 2.5, scores
+    assert scores[REVERSED].max() < scores[GENUINE].min() / 2, scores
+    assert set(found[1].verdicts[GENUINE]) == {"kept"}
+    assert "kept" not in found[1].verdicts[REVERSED]
+
+
+def test_doing_nothing_weighs_next_to_nothing(found: tuple[Demonstrations, Transferability]) -> None:
+    shown, transferability = found
+    scores = transferability.scores
+    assert len(shown) == 3 * COUNT
+    assert shown.terminated[IDLE].all() and not shown.terminated[np.concatenate((GENUINE, REVERSED))].any()
+    assert scores[GENUINE].min() > 0.05, scores
+    assert scores[IDLE].max() < scores[GENUINE].min() / 2, scores
+    assert sampling_mass(transferability.weights, shown)[IDLE].sum() < 0.05, scores
