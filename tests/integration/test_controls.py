@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from oodil.orchestrator import execute
+from oodil.pipeline.algorithms.weights import sampling_mass
 from oodil.pipeline.artifacts import RunDirectory, write_artifact
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.datasets import encode_demonstrations
