@@ -1,5 +1,5 @@
 """Two controls of the transferability itself, with real training in a gravity that is not the demonstrators': what no
-physics can do comes out far below what an expert did, and a robot that does nothing and falls weighs next to nothing."""
+physics can do comes out far below what an expert did, and a robot that does nothing and falls weighs almost nothing."""
 
 from dataclasses import replace
 from pathlib import Path
