@@ -53,7 +53,7 @@ def test_misdeeds_change_nothing(config: Path, tmp_path: Path, monkeypatch: pyte
     run("run", str(config), "--run-dir", str(tmp_path / "calm"), "--workers", "2")
     allow(misdeeds, 0)
     live = LiveRun("run", str(config), "--run-dir", str(tmp_path / "flaky"), "--workers", "2")
-    wait_for(has_checkpoint(tmp_path / "flaky", "imitation", "imitation", 1), "checkpoint")
+    wait_for(has_checkpoint(tmp_path / "flaky", "imitation", "training-1", 1), "checkpoint")
     assert not list(misdeeds.iterdir()), "the cluster jobs were over before every misdeed was done"
     allow(misdeeds, 1)
     code, output = live.finish()

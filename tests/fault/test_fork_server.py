@@ -90,7 +90,7 @@ def test_children_of_a_killed_server_are_gone_before_their_jobs_go_on(tmp_path: 
 
     killer = threading.Thread(target=kill)
     killer.start()
-    outcome = LocalEngine(2).run_jobs(FakeStage(True), run, ["waits", "a"], on_event, lambda: False)
+    outcome = LocalEngine(3).run_jobs(FakeStage(True), run, ["waits", "a"], on_event, lambda: False)
     killer.join()
     assert outcome.done == ["waits", "a"]
     assert failures(events) == [("waits", 1, True)]

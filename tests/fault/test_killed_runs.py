@@ -30,7 +30,7 @@ def start(run_dir: Path, workers: int) -> LiveRun:
         ("clustering", "clustering", 7, 2, 1),
         ("imitators", "cluster-1", 9, 2, 0),
         ("imitators", "cluster-0", 20, 0, 2),
-        ("imitation", "imitation", 17, 1, 4),
+        ("imitation", "training-1", 17, 1, 4),
     ],
 )
 def test_kill_all_then_resume(
@@ -48,7 +48,7 @@ def test_kill_all_then_resume(
 
 def test_kill_the_orchestrator_alone(undisturbed: dict[str, str], tmp_path: Path) -> None:
     live = start(tmp_path / "run", 2)
-    wait_for(has_checkpoint(tmp_path / "run", "imitation", "imitation", 2), "checkpoint")
+    wait_for(has_checkpoint(tmp_path / "run", "imitation", "training-1", 2), "checkpoint")
     live.process.kill()
     nothing_left(live)
     run("resume", str(tmp_path / "run"), "--workers", "2")
@@ -59,8 +59,8 @@ def test_kill_the_orchestrator_alone(undisturbed: dict[str, str], tmp_path: Path
     ("stage", "job", "victim"),
     [
         ("imitators", "cluster-0", "imitators-cluster-0"),
-        ("imitation", "imitation", "imitation-imitation"),
-        ("imitation", "imitation", "imitation-rollout-worker-1"),
+        ("imitation", "training-1", "imitation-training-1"),
+        ("imitation", "training-1", "imitation-rollout-worker-1"),
     ],
 )
 def test_kill_one_child(undisturbed: dict[str, str], tmp_path: Path, stage: str, job: str, victim: str) -> None:
@@ -76,7 +76,7 @@ def test_kill_one_child(undisturbed: dict[str, str], tmp_path: Path, stage: str,
 
 def test_kill_the_fork_server(undisturbed: dict[str, str], tmp_path: Path) -> None:
     live = start(tmp_path / "run", 2)
-    for stage, job in (("imitators", "cluster-0"), ("imitation", "imitation")):
+    for stage, job in (("imitators", "cluster-0"), ("imitation", "training-1")):
         wait_for(has_checkpoint(tmp_path / "run", stage, job, 4), "checkpoint")
         live.fork_server().kill()
     code, output = live.finish()
@@ -91,7 +91,7 @@ def test_an_interrupt_checkpoints_and_stops(
     undisturbed: dict[str, str], tmp_path: Path, number: signal.Signals
 ) -> None:
     live = start(tmp_path / "run", 2)
-    wait_for(has_checkpoint(tmp_path / "run", "imitation", "imitation", 5), "checkpoint")
+    wait_for(has_checkpoint(tmp_path / "run", "imitation", "training-1", 5), "checkpoint")
     if number == signal.SIGINT:
         interrupt(live, number)
     else:

@@ -172,8 +172,9 @@ def test_a_job_that_hangs_is_killed_and_continues_from_its_checkpoint(tmp_path: 
 def test_a_killed_learner_finds_its_workers_again(tmp_path: Path) -> None:
     run = fake_run(tmp_path)
     events: list[Event] = []
-    outcome = LocalEngine(2).run_jobs(FakeStage(True), run, ["killed", "a"], events.append, lambda: False)
+    outcome = LocalEngine(3).run_jobs(FakeStage(True), run, ["killed", "a"], events.append, lambda: False)
     assert outcome.done == ["killed", "a"] and not outcome.failed
+    assert len(list(run.directory.logs().glob("learner-rollout-worker-*"))) == 3, "workers collect"
     assert not [event for event in events if isinstance(event.report, Replaced)]
     assert lines(tmp_path / "killed.began_at") == ["0", "3"]
     assert run.job_artifact("learner", "killed").sha256 == run.job_artifact("learner", "a").sha256
@@ -185,7 +186,7 @@ def test_workers_that_keep_dying_fail_the_stage(tmp_path: Path) -> None:
     killer = threading.Thread(target=_kill_workers, args=(stop,))
     killer.start()
     try:
-        outcome = LocalEngine(1).run_jobs(FakeStage(True), run, ["a", "b"], lambda event: None, lambda: False)
+        outcome = LocalEngine(3).run_jobs(FakeStage(True), run, ["a", "b"], lambda event: None, lambda: False)
     finally:
         stop.set()
         killer.join()
@@ -213,7 +214,7 @@ from oodil.workers.local_engine import LocalEngine
 
 if __name__ == "__main__":
     run = fake_run(Path({str(tmp_path)!r}))
-    LocalEngine(2).run_jobs(FakeStage({distributed}), run, ["waits", "a"], print, lambda: False)
+    LocalEngine(3).run_jobs(FakeStage({distributed}), run, ["waits", "a"], print, lambda: False)
 """
     script = tmp_path / "orchestrator.py"
     script.write_text(code)

@@ -70,7 +70,7 @@ class RunInTerminal(LiveRun):
 @pytest.mark.parametrize("times", [1, 2])
 def test_ctrl_c(undisturbed: dict[str, str], tmp_path: Path, times: int) -> None:
     live = RunInTerminal("run", str(MICRO), "--run-dir", str(tmp_path / "stopped"), "--workers", "2")
-    wait_for(has_checkpoint(tmp_path / "stopped", "imitation", "imitation", 2), "checkpoint")
+    wait_for(has_checkpoint(tmp_path / "stopped", "imitation", "training-1", 2), "checkpoint")
     if times == 2:
         # A worker that is stuck keeps the first Ctrl-C from coming to an end.
         for worker in ("imitation-rollout-worker-0", "imitation-rollout-worker-1"):

@@ -77,7 +77,7 @@ def test_the_cable_is_pulled_and_plugged_in_again(undisturbed: dict[str, str], h
     remote = subprocess.Popen(hosts.command(hosts.elsewhere) + command, stdout=subprocess.DEVNULL)
     try:
         live.child("imitation-rollout-worker-0").suspend()
-        wait_for(has_checkpoint(run_dir, "imitation", "imitation", 3), "checkpoint made with the remote worker")
+        wait_for(has_checkpoint(run_dir, "imitation", "training-1", 3), "checkpoint made with the remote worker")
         hosts.cable("down")
         time.sleep(CUT_S)
         assert not (run_dir / "stages" / "imitation").exists(), "the run ended while the cable was out"

@@ -45,7 +45,7 @@ def config(tmp_path: Path) -> Path:
 def test_any_number_of_workers_and_a_kill_give_the_same_bits(config: Path, tmp_path: Path) -> None:
     run("run", str(config), "--run-dir", str(tmp_path / "inline"), "--workers", "0")
     live = LiveRun("run", str(config), "--run-dir", str(tmp_path / "killed"), "--workers", "2")
-    wait_for(has_checkpoint(tmp_path / "killed", "imitation", "imitation", 5), "checkpoint")
+    wait_for(has_checkpoint(tmp_path / "killed", "imitation", "training-1", 5), "checkpoint")
     live.kill_group()
     nothing_left(live)
     run("resume", str(tmp_path / "killed"), "--workers", "1")

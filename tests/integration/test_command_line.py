@@ -64,7 +64,8 @@ def config_for(tmp_path: Path):
         ("environment={id: CartPole-v1}", "the action space is Discrete(2); only Box spaces can be used"),
         ("environment.dynamics.gravty=9", "gravty"),
         ("environment.dynamics.gravity=-9", "gravity is -9.0; it must be positive"),
-        ("imitation.gail.discriminator.ignored=[12]", "ignored is [12]; states have the dimensions 0 to 11"),
+        ("imitation.gail.discriminator.ignored=[12]", "unknown key 'imitation.gail.discriminator.ignored'"),
+        ("imitation.gail.discriminator.view=speed", "view: Input should be 'change' or 'raw', got 'speed'"),
         ("nonsense", "not of the form key=value"),
     ],
 )

@@ -36,14 +36,17 @@ def content(run: Run, stage: str, job: str) -> str:
 
 @pytest.mark.parametrize("distributed", [False, True])
 def test_the_result_does_not_depend_on_the_number_of_workers(tmp_path: Path, distributed: bool) -> None:
+    """Two jobs of a distributed stage run one after another, side by side, or with rollout workers."""
     stage = FakeStage(distributed).name
     hashes = set()
-    for workers in (0, 1, 3):
+    for workers in (0, 1, 2, 3):
         run = fake_run(tmp_path / str(workers))
         outcome, events = run_jobs(run, workers, ["a", "b"], distributed)
         assert outcome == Outcome(done=["a", "b"])
         assert events.count(Event("a", Started(1))) == events.count(Event("a", Finished(DONE))) == 1
         assert any(isinstance(e.report, Progress) and (e.report.done, e.report.total) == (6, 6) for e in events)
+        collected_for = bool(list(run.directory.logs().glob("learner-rollout-worker-*")))
+        assert collected_for == (distributed and workers == 3)
         assert not run.directory.checkpoints(stage, "a").exists()
         assert "torch" in run.job_artifact(stage, "a").versions
         metrics = read_metrics(run.directory.metrics(stage, "a"))
@@ -75,7 +78,7 @@ def test_attempts_that_get_further_do_not_use_any_up(tmp_path: Path, workers: in
     assert content(run, "jobs", job) == content(run, "jobs", "a")
 
 
-@pytest.mark.parametrize(("workers", "distributed"), [(0, False), (2, False), (2, True)])
+@pytest.mark.parametrize(("workers", "distributed"), [(0, False), (2, False), (2, True), (3, True)])
 def test_stopped_and_resumed_equals_uninterrupted(tmp_path: Path, workers: int, distributed: bool) -> None:
     stage = FakeStage(distributed)
     whole, stopped = fake_run(tmp_path / "whole"), fake_run(tmp_path / "stopped")

@@ -38,8 +38,8 @@ RELEVANT = {
     "clustering.temperature=0.5": ("clustering", "temperature 1.0 -> 0.5"),
     "transferability.num_trainings=2": ("imitators", "num_trainings 1 -> 2"),
     "transferability.gail.lag=0": ("imitators", "gail.lag 1 -> 0"),
-    "transferability.final_steps=11": ("transferability", "final_steps 10 -> 11"),
-    "transferability.sharpening=1": ("transferability", "sharpening 4.0 -> 1.0"),
+    "transferability.reading.steps=11": ("transferability", "reading.steps 10 -> 11"),
+    "transferability.kept_from=0.25": ("transferability", "kept_from 0.5 -> 0.25"),
     "imitation.gail.discount=0.9": ("imitation", "gail.discount 0.995 -> 0.9"),
     MARKS: ("marks", "transferable[1] False -> True"),
 }
@@ -129,12 +129,12 @@ def test_no_field_of_evaluation_or_runtime_is_forgotten() -> None:
 
 
 def test_a_stale_stage_is_shown_and_not_used(run_dir: Path) -> None:
-    config = oodil.load_config(MICRO, [BASELINES, "transferability.sharpening=1"])
+    config = oodil.load_config(MICRO, [BASELINES, "transferability.kept_from=0.25"])
     results = oodil.RunResults(Run(config, oodil.open_run(run_dir).run.directory))
     described = results.describe()["stages"]
     assert described["transferability"] == described["transferability"] | {
         "state": "stale",
-        "reason": "sharpening 4.0 -> 1.0",
+        "reason": "kept_from 0.5 -> 0.25",
         "sha256": None,
     }
     assert described["imitation"]["state"] == "stale"

@@ -11,6 +11,10 @@ from typer.testing import CliRunner
 
 import oodil
 from oodil.cli import app
+from oodil.pipeline.algorithms.weights import share_lasted, transferability_of_divergences
+from oodil.pipeline.results import Reading
+from oodil.pipeline.stages.imitators import ClusterJob
+from oodil.pipeline.stages.transferability import TransferabilityStage
 from oodil.pipeline.stages.weighting import CannotScoreError
 from tests.runs import MICRO, ROOT
 
@@ -54,10 +58,26 @@ def test_its_weights_are_what_the_policy_learned_from_and_it_scores_others(run_d
 
 
 def test_frozen_models_say_of_the_runs_own_demonstrations_what_the_run_said(run_dir: Path) -> None:
+    """The run took the one of each two readers that had not seen a demonstration; other demonstrations get both."""
     results = oodil.open_run(run_dir)
-    again = results.score(results.demonstrations)
-    np.testing.assert_array_equal(again.clusters, results.transferability.clusters)
-    np.testing.assert_allclose(again.scores, results.transferability.scores, rtol=1e-5)
+    run, demonstrations, held = results.run, results.demonstrations, results.transferability
+    again = results.score(demonstrations)
+    np.testing.assert_array_equal(again.clusters, held.clusters)
+    assert again.threshold == held.threshold
+    for job in TransferabilityStage().jobs(run):
+        reading, readers = (
+            Reading.load(run.job_artifact("transferability", job)),
+            ClusterJob.of(run, job).readers(run.config),
+        )
+        readers.load(reading.readers)
+        members, pairs = reading.demonstrations, readers.divergences(demonstrations.select(reading.demonstrations))
+        is_told = np.isclose(pairs.reshape(-1, 2, len(members)), reading.divergences[:, None], rtol=1e-5, atol=1e-6)
+        assert is_told.any(axis=1).all()
+        lasted = share_lasted(demonstrations.select(members), 1000)
+        both = transferability_of_divergences(pairs).mean(axis=0) * lasted
+        np.testing.assert_allclose(again.scores[members], both, rtol=1e-5)
+        told = transferability_of_divergences(reading.divergences).mean(axis=0) * lasted
+        np.testing.assert_allclose(held.scores[members], told, rtol=1e-5)
     one = results.score(results.demonstrations.select(np.array([2])))
     np.testing.assert_allclose(one.weights, [1.0])
 

@@ -29,7 +29,11 @@ def build(pairs):
         terminated=np.zeros(len(lengths), np.bool_),
     )
     weights = np.array([weight for _, weight in pairs])
-    return AdversarialReward(demonstrations, weights, DiscriminatorConfig(hidden=(2,)), 9, 0), lengths, weights
+    return (
+        AdversarialReward(demonstrations, weights, DiscriminatorConfig(hidden=(2,), view="raw"), 9, 0),
+        lengths,
+        weights,
+    )
 
 
 class Grid:
