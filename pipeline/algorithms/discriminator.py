@@ -110,10 +110,16 @@ class Discriminator(nn.Module):
 
 
 @torch.no_grad()
+def mean_logits(discriminator: Discriminator, inputs: Tensor, counts: NDArray[np.int64]) -> Array:
+    """Return (N,) logits averaged over each of N demonstrations, of which ``counts`` (N,) of the inputs are."""
+    logits = discriminator(inputs).double().numpy()
+    return np.asarray(np.add.reduceat(logits, offsets_of(counts)[:-1]) / counts)
+
+
 def mean_logit_per_demonstration(discriminator: Discriminator, demonstrations: Demonstrations) -> NDArray[np.float64]:
     """Return (N,) logits averaged over each demonstration, for Eqn (6)."""
     starts = demonstrations.transition_starts()
     states = demonstrations.observations
-    logits = discriminator(discriminator.inputs(states[starts], states[starts + 1])).double().numpy()
-    counts = demonstrations.lengths - 1
-    return np.asarray(np.add.reduceat(logits, offsets_of(counts)[:-1]) / counts)
+    return mean_logits(
+        discriminator, discriminator.inputs(states[starts], states[starts + 1]), demonstrations.lengths - 1
+    )

@@ -70,8 +70,7 @@ class AdversarialReward:
     def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
         """Return (T, G) rewards; `Learner` asks for them before the discriminator's step of the same iteration."""
         logits = self.discriminator(self._inputs_of(batch))
-        rewards = imitation_reward(logits).numpy().reshape(batch.terminated.shape)
-        return rewards
+        return imitation_reward(logits).numpy().reshape(batch.terminated.shape)
 
     def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
         """Train the discriminator on the batch, a part of it at each step, and on as many demonstration pairs."""

@@ -14,10 +14,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from oodil.pipeline.algorithms.discriminator import Discriminator
+from oodil.pipeline.algorithms.discriminator import Discriminator, mean_logits
 from oodil.pipeline.artifacts import below, nested
 from oodil.pipeline.config import DiscriminatorConfig, ReadingConfig
-from oodil.pipeline.data import Demonstrations, offsets_of
+from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.seeding import derive_key, numpy_rng, torch_seed
 
 Array = NDArray[np.float64]
@@ -114,8 +114,6 @@ class _Transitions:
         """Return (count, 2S) inputs, drawn with replacement."""
         return self._inputs[torch.from_numpy(rng.choice(rows, count))]
 
-    @torch.no_grad()
     def mean_logits(self, net: Discriminator) -> Array:
         """Return (N,) mean logits over the transitions of each."""
-        logits = net(self._inputs).double().numpy()
-        return np.asarray(np.add.reduceat(logits, offsets_of(self._counts)[:-1]) / self._counts)
+        return mean_logits(net, self._inputs, self._counts)
