@@ -72,7 +72,7 @@ TASKS = {
     "driving": Task(
         "oodil/Driving-v0", "hand-written", {"obstacle_1": 0.5, "obstacle_2": 0.25, "speed": 1.0},
         {"obstacle_1": 0.4, "obstacle_2": 0.25, "speed": 1.0}, {"obstacle_1": 0.3, "obstacle_2": 0.2, "speed": 1.0},
-        50, 0, 1_000_000, -500,
+        50, -500, 1_000_000, -500,
     ),
     "panda": Task(
         "oodil/Panda20Hz-v0", "hand-written", {"joint_1": 0},

@@ -21,13 +21,14 @@ WORST = "auroc", "share", "effective_number"
 def line_of(results: oodil.RunResults) -> dict[str, Any]:
     """Return the figures of a finished run."""
     found, marks = results.transferability, results.marks()
+    solved = results.config.demonstrations.minimum_return or 0.0
     policies = {}
     for policy in results.policies:
         trainings = Trainings.load(results.artifact(policy.name)).trainings
         final = results.evaluation(policy.name)
         policies[policy.name] = {
             "mean_return": final.mean_return,
-            "solved": float((final.returns >= 0).mean()),
+            "solved": float((final.returns >= solved).mean()),
             "trainings": [vars(training) for training in trainings],
         }
     sources = results.demonstrations.sources

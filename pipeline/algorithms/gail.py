@@ -19,6 +19,7 @@ from oodil.pipeline.algorithms.discriminator import (
     mean_logit_per_demonstration,
 )
 from oodil.pipeline.algorithms.divergence import sliced_wasserstein
+from oodil.pipeline.algorithms.ends import DemonstratedEnds
 from oodil.pipeline.algorithms.learner import Learner
 from oodil.pipeline.algorithms.standardization import standardization
 from oodil.pipeline.artifacts import below, nested
@@ -44,8 +45,6 @@ class AdversarialReward:
     ) -> None:
         """Prepare to draw pairs in proportion to ``weights`` (N,), one per demonstration (Eqn 7).
 
-        A demonstration with fewer than ``max_episode_steps`` transitions has reached an end.
-
         Raises ValueError unless the weights are finite, not negative and not all zero.
         """
         if weights.shape != (len(demonstrations),) or not np.isfinite(weights).all() or (weights < 0).any():
@@ -57,7 +56,7 @@ class AdversarialReward:
         self._cumulative = np.cumsum(np.repeat(weights, demonstrations.lengths - 1))
         self._state_weights = np.repeat(weights, demonstrations.lengths)
         self._observations = demonstrations.observations
-        self.ended_share = float(np.average(demonstrations.lengths - 1 < max_episode_steps, weights=weights))
+        self._ends = DemonstratedEnds(demonstrations, weights, max_episode_steps, derive_key(root_seed, "ends"))
         seed = torch_seed(derive_key(root_seed, "discriminator", "initial"))
         self.discriminator = Discriminator(demonstrations, weights, config, seed)
         self._policy_inputs: tuple[TransitionBatch, Tensor] | None = None
@@ -71,6 +70,10 @@ class AdversarialReward:
         """Return (T, G) rewards; `Learner` asks for them before the discriminator's step of the same iteration."""
         logits = self.discriminator(self._inputs_of(batch))
         return imitation_reward(logits).numpy().reshape(batch.terminated.shape)
+
+    def goes_on(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return (E,) whether an end in each of (E, S) states is worth an endless reward: demonstrations end there."""
+        return self._ends.include(states)
 
     def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
         """Train the discriminator on the batch, a part of it at each step, and on as many demonstration pairs."""

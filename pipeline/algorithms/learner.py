@@ -28,15 +28,17 @@ from oodil.pipeline.seeding import derive_key, torch_seed
 class RewardModel(Protocol):
     """Where an iteration's rewards come from."""
 
-    ended_share: float
-    """Share of an endless last reward that the end of an episode is worth: that of the demonstrations that end, too. A
-    positive reward pays for going on, which is right where none of them ends, and puts off a goal that they reach."""
-
     def state_standardization(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Return (S,) mean and scale to normalize states by; None lets the learner estimate them."""
 
     def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
         """Return (T, G) rewards."""
+
+    def goes_on(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return (E,) whether an episode that ended in each of (E, S) states has its last reward for ever.
+
+        A positive reward pays for going on: right where demonstrations go on, wrong at a goal where they end.
+        """
 
     def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
         """Take the iteration's training step and return metrics; ``step_scale`` multiplies the step size."""
@@ -51,8 +53,6 @@ class RewardModel(Protocol):
 class EnvReward:
     """The environment's own reward, for training experts only."""
 
-    ended_share = 0.0
-
     def state_standardization(self) -> None:
         """Return None: the states are not known before training."""
         return None
@@ -60,6 +60,10 @@ class EnvReward:
     def rewards(self, batch: TransitionBatch) -> NDArray[np.float32]:
         """Return the (T, G) rewards of the environment."""
         return batch.env_rewards.astype(np.float32)
+
+    def goes_on(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return that none does: the environment says itself what an end is worth."""
+        return np.zeros(len(states), np.bool_)
 
     def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
         """Return no metrics: an environment's reward does not learn."""
@@ -85,7 +89,6 @@ class Learner(Generic[Reward]):
         self.config = config
         self.reward_model = reward_model
         self.root_seed = root_seed
-        self._reward_scale = 1 - config.discount if config.scale_rewards else 1.0
         rng = torch.Generator().manual_seed(torch_seed(derive_key(root_seed, "learner", "initial")))
         self.policy = PolicyNetwork(observation_dim, action_dim, config.policy_hidden, rng)
         with torch.no_grad():
@@ -106,7 +109,7 @@ class Learner(Generic[Reward]):
         """Learn from one iteration's batch.
 
         Returns metrics, by names that do not change:
-            reward: mean of the rewards that the policy learned from.
+            reward: mean of what the reward model gave.
             policy_lag: updates since the policy that collected the batch, 0 or 1.
             kl: divergence from the policy before the update, in nats per state.
             entropy: of the new policy, in nats.
@@ -119,15 +122,17 @@ class Learner(Generic[Reward]):
         step_scale = 1 - iteration / config.num_iterations if config.anneal else 1.0
         rng = torch.Generator().manual_seed(torch_seed(derive_key(self.root_seed, "learner", iteration)))
         # Scaled by 1 - discount, values are averages of rewards, and so of order one for every horizon.
-        rewards = self.reward_model.rewards(batch) * np.float32(self._reward_scale)
-        rewards[batch.terminated] *= 1 + self.reward_model.ended_share * config.discount / (1 - config.discount)
+        rewards = self.reward_model.rewards(batch)
+        metrics = {"reward": float(rewards.mean()), "policy_lag": float(iteration - batch.policy_version)}
+        rewards *= np.float32(1 - config.discount)
+        for_ever = self.reward_model.goes_on(batch.next_observations[batch.terminated])
+        rewards[batch.terminated] *= np.where(for_ever, np.float32(1 / (1 - config.discount)), np.float32(1))
         observations = torch.from_numpy(batch.observations).flatten(0, 1)
         inputs = self.policy.normalize(observations)
         values, next_values = self._values(inputs, batch)
         advantages = generalized_advantages(
             rewards, values, next_values, batch.terminated, batch.truncated, config.discount, config.gae_lambda
         )
-        metrics = {"reward": float(rewards.mean()), "policy_lag": float(iteration - batch.policy_version)}
         metrics |= self.policy_optimizer.update(
             observations,
             torch.from_numpy(batch.actions).flatten(0, 1),

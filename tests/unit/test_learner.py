@@ -10,12 +10,13 @@ import safetensors.numpy
 import torch
 
 import oodil.pipeline.algorithms.learner as learner_module
+from oodil.pipeline.algorithms.ends import DemonstratedEnds
 from oodil.pipeline.algorithms.gail import AdversarialReward
 from oodil.pipeline.algorithms.learner import EnvReward, Learner
 from oodil.pipeline.artifacts import encode_arrays
 from oodil.pipeline.collecting import collect
 from oodil.pipeline.config import DiscriminatorConfig, GailConfig, PpoConfig, TrainingConfig, TrpoConfig, ValueConfig
-from oodil.pipeline.data import TransitionBatch, Unit
+from oodil.pipeline.data import Demonstrations, Episode, TransitionBatch, Unit
 from oodil.pipeline.seeding import derive_key
 
 TRPO, PPO = TrpoConfig(), PpoConfig(minibatch_size=40, epochs=2, learning_rate=1e-3)
@@ -83,7 +84,6 @@ def test_interrupted_equals_uninterrupted(shown, assert_same_bits, policy_optimi
         "demonstrations": shown if imitate else None,
         "policy_optimizer": policy_optimizer,
         "normalize_observations": normalize,
-        "scale_rewards": normalize,
         "initial_log_std": -0.5,
     }
     whole = build(**settings)
@@ -267,20 +267,36 @@ def test_steps_shrink_linearly_over_the_training(shown, rollout, anneal, expecte
 class TestEnds:
     """What the end of an episode is worth to an imitator."""
 
-    @pytest.mark.parametrize(("lengths", "share"), [((21, 21), 0.0), ((21, 11), 0.5), ((5, 11), 1.0)])
-    def test_it_is_the_share_of_the_demonstrations_that_end_before_the_time_limit(self, demonstrations, lengths, share):
-        shown = demonstrations(*lengths)
-        assert AdversarialReward(shown, np.ones(2), DiscriminatorConfig(), 20, 0).ended_share == share
-        weighted = AdversarialReward(shown, np.array([1.0, 0.0]), DiscriminatorConfig(), 20, 0)
-        assert weighted.ended_share == float(lengths[0] < 21)
+    @staticmethod
+    def approaching(lengths):
+        """Return demonstrations that walk from 0 towards 1, as far as each comes in 20 steps."""
+        return Demonstrations.of(
+            [Episode(np.linspace(0, (n - 1) / 20, n)[:, None], 0.0, True) for n in lengths], "walks"
+        )
+
+    def test_it_goes_on_where_demonstrations_of_any_weight_end(self):
+        shown = self.approaching((11, 21))
+        key = derive_key(0, "test")
+        asked = np.array([[0.1], [0.5], [0.9], [1.0], [7.0]], np.float32)
+        for weights, limit, expected in (
+            ([1.0, 0.0], 100, [False, True, True, True, True]),
+            ([0.0, 1.0], 100, [False, False, False, True, True]),
+            ([1.0, 0.0], 10, [False] * 5),
+            ([0.0, 1.0], 20, [False] * 5),
+        ):
+            ends = DemonstratedEnds(shown, np.array(weights), limit, key)
+            assert ends.include(asked).tolist() == expected
+        assert ends.include(asked[:0]).shape == (0,)
 
     def test_the_last_reward_goes_on_for_ever(self, demonstrations, rollout, monkeypatch):
-        """With discount 1/2 a reward r for ever is worth 2 r, and half of the demonstrations end."""
+        """With discount 1/2 a reward r is worth r / 2 each step, and r for ever."""
         config = GailConfig(total_steps=100, discount=0.5)
         reward = AdversarialReward(demonstrations(21, 11), np.ones(2), DiscriminatorConfig(), 20, 0)
         learner, batch = Learner(3, 2, config, reward, 0), TransitionBatch.of([rollout(0)])
-        batch.terminated[2, 1] = True
-        plain = learner.reward_model.rewards(batch)
+        batch.terminated[[1, 2], [0, 1]] = True
+        monkeypatch.setattr(reward, "goes_on", lambda states: (states == batch.next_observations[2, 1]).all(1))
+        expected = 0.5 * reward.rewards(batch)
+        expected[2, 1] *= 2
         seen = []
 
         def advantages(rewards, *rest):
@@ -289,7 +305,6 @@ class TestEnds:
 
         monkeypatch.setattr(learner_module, "generalized_advantages", advantages)
         learner.update(batch, 0)
-        expected = np.where(batch.terminated, 1.5 * plain, plain)
         np.testing.assert_allclose(seen[0], expected, rtol=1e-6)
 
 
