@@ -288,7 +288,7 @@ CLUSTERING_PRESETS: dict[str, dict[str, Any]] = {
 
 class ReadingConfig(_Section):
     """How it is read what an imitator reproduces: by fresh discriminators, trained on halves of demonstrations and
-    episodes, that read the other halves. Its fields are theirs, but for the first."""
+    episodes, that read the other halves, or by its own discriminator. All fields but the first are of fresh ones."""
 
     discriminator: Literal["fresh", "last"] = "fresh"
     """Who reads: fresh discriminators, or the one that the imitator was trained against, as it stood last (the paper's
