@@ -205,9 +205,12 @@ class DemonstrationsConfig(_Section):
 
 
 class ClusteringConfig(_Section):
-    """Contrastive clustering, Algorithm 1. ``preset: paper`` gives the appendix's constants, ``preset: official`` the
-    released code's; the defaults differ where docs/decisions.md says why."""
+    """Contrastive clustering, Algorithm 1, or k-means. ``preset: paper`` gives the appendix's constants, ``preset:
+    official`` the released code's (docs/presets.md); the defaults differ where docs/decisions.md says why."""
 
+    features: Literal["contrastive", "states"] = "contrastive"
+    """What is clustered: features that an encoder learns, or the standardized states of one sub-trajectory of each
+    demonstration, by k-means, which trains nothing (appendix C.6)."""
     num_clusters: PositiveInt = 5
     """K at initialization; clusters may end up empty. With 1 there is nothing to train."""
     subtrajectory_length: int = Field(default=20, ge=2)
@@ -264,7 +267,10 @@ CLUSTERING_PRESETS: dict[str, dict[str, Any]] = {
         "learning_rate": 0.01,
         "sufficient_stability": None,
         "joint_iterations": 2000,
+        "reduction": "mean",
         "initial_centers": "trajectories",
+        "normalize_centers": False,
+        "label_draws": 1,
     },
     "official": {
         "sampling": "fixed_stride",
@@ -282,8 +288,11 @@ CLUSTERING_PRESETS: dict[str, dict[str, Any]] = {
 
 class ReadingConfig(_Section):
     """How it is read what an imitator reproduces: by fresh discriminators, trained on halves of demonstrations and
-    episodes, that read the other halves."""
+    episodes, that read the other halves, or by its own discriminator. All fields but the first are of fresh ones."""
 
+    discriminator: Literal["fresh", "last"] = "fresh"
+    """Who reads: fresh discriminators, or the one that the imitator was trained against, as it stood last (the paper's
+    Eqn 6). The latter says nothing of its error: its intervals have no width."""
     steps: PositiveInt = 600
     """Steps of each discriminator."""
     learning_rate: PositiveFloat = 3e-3
@@ -294,6 +303,11 @@ class ReadingConfig(_Section):
     """Transitions from either side in a step."""
     repetitions: PositiveInt = 4
     """Times that other halves are drawn, two discriminators each."""
+
+    @property
+    def num_readers(self) -> int:
+        """Discriminators that read a demonstration of which they have seen nothing."""
+        return 2 * self.repetitions if self.discriminator == "fresh" else 1
 
 
 class TransferabilityConfig(_Section):
@@ -308,7 +322,8 @@ class TransferabilityConfig(_Section):
     """Trainings of each cluster's imitator, each with a seed of its own; the one whose transitions come closest to the
     cluster's counts."""
     kept_from: UnitInterval = 0.5
-    """A demonstration is kept if its score is at least this share of the best cluster's."""
+    """A demonstration is kept if its score is at least this share of the best cluster's; with 0 everything is kept, and
+    weighs in proportion to its score (the paper's Eqn 7)."""
 
     @model_validator(mode="before")
     @classmethod
@@ -373,9 +388,44 @@ class RuntimeConfig(_Section):
     """Pause before the first restart; it doubles with each further one, up to 10 s."""
 
 
+_PAPER_GAIL: dict[str, Any] = {
+    "lag": 0,
+    "normalize_observations": False,
+    "anneal": False,
+    "final_std": None,
+    "policy_optimizer": {"kind": "trpo", "fisher_every": 1},
+    "value": {"learning_rate": 3e-4, "epochs": 1, "minibatch_size": 86},  # 30 steps per iteration
+    "discriminator": {"steps_per_iteration": 1, "view": "raw", "gradient_penalty": 0.0},
+}
+"""Constants of every imitation. The appendix gives none, so both presets have the released code's."""
+
+PRESETS: dict[str, dict[str, Any]] = {
+    name: {
+        "clustering": {"preset": name},
+        "transferability": {"gail": _PAPER_GAIL, "reading": {"discriminator": "last"}, "kept_from": 0.0},
+        "imitation": {"gail": _PAPER_GAIL, "num_trainings": 1},
+    }
+    for name in CLUSTERING_PRESETS
+}
+"""What ``preset`` can stand for (docs/presets.md). What differs by environment is left to the configuration."""
+
+
+def _filled_in(values: Any, defaults: dict[str, Any]) -> Any:
+    """Return values with defaults, also those of their sections; one of another kind gets none."""
+    if not isinstance(values, dict) or values.get("kind", defaults.get("kind")) != defaults.get("kind"):
+        return values
+    return values | {
+        key: _filled_in(values.get(key, {}), default) if isinstance(default, dict) else values.get(key, default)
+        for key, default in defaults.items()
+    }
+
+
 class RunConfig(_Section):
     """One run: demonstrations, clusters, transferability, policy."""
 
+    preset: Literal["paper", "official"] | None = None
+    """Constants of the whole run where nothing else is said: the appendix's, or the released code's (docs/presets.md);
+    null for ours."""
     name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
     """Name of the run and of its default folder."""
     seed: int = Field(default=0, ge=0)
@@ -399,3 +449,10 @@ class RunConfig(_Section):
     """What is measured beside the training."""
     runtime: RuntimeConfig = RuntimeConfig()
     """How it runs."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _preset(cls, values: Any) -> Any:
+        if isinstance(values, dict) and isinstance(values.get("preset"), str) and values["preset"] in PRESETS:
+            return _filled_in(values, PRESETS[values["preset"]])
+        return values

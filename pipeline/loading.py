@@ -57,6 +57,8 @@ def load_config(
         path = find_config(source)
         values, origin, base = _read_yaml(path), str(path), path.resolve().parent
     for override in overrides or ():
+        if isinstance(source, RunConfig) and override.partition("=")[0] in ("preset", "clustering.preset"):
+            raise ConfigError(f"override {override!r}: a configuration that is made leaves nothing open for a preset")
         apply_override(values, override)
     return _resolve_paths(parse_config(values, origin), base)
 

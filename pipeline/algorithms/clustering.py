@@ -1,4 +1,4 @@
-"""Contrastive clustering, phase 1 of the method (Algorithm 1 of the appendix, docs/algorithms.md).
+"""Phase 1 of the method: contrastive clustering (Algorithm 1 of the appendix), or k-means of states (appendix C.6).
 
 The encoder is trained first by the contrastive loss alone, then together with K centers that follow their members as
 running means. Unlike the paper, the counters of these means start above zero, as in the official code, centers stay on
@@ -19,9 +19,8 @@ from sklearn.cluster import KMeans
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from oodil.pipeline.algorithms.contrastive import Encoder, Sampling, Subtrajectories, contrastive_loss
+from oodil.pipeline.algorithms.contrastive import Encoder, Sampling, States, Subtrajectories, contrastive_loss
 from oodil.pipeline.algorithms.optimizer import Adam
-from oodil.pipeline.algorithms.standardization import standardization
 from oodil.pipeline.artifacts import below, nested
 from oodil.pipeline.config import ClusteringConfig
 from oodil.pipeline.data import Demonstrations
@@ -67,7 +66,7 @@ class Labeling:
     labels: NDArray[np.int32]
     """(N,) cluster ids."""
     features: NDArray[np.float32]
-    """(N, E) unit features."""
+    """(N, E) features; those of an encoder have length 1."""
     stability: float
     """Share of single draws whose own label is the final one."""
 
@@ -76,11 +75,11 @@ class Labeling:
 class ClusterModel:
     """A frozen encoder and its centers: all that is needed to label demonstrations, old or new."""
 
-    encoder: Encoder
+    encoder: Encoder | States
     centers: Tensor
     """(K, E)"""
     counts: Tensor
-    """(K,) int64 counters of Eqn (4)."""
+    """(K,) int64 counters of Eqn (4), or members in k-means."""
     sampling: Sampling
     state_mean: NDArray[np.float32]
     """(S,) subtracted from the states."""
@@ -89,7 +88,7 @@ class ClusterModel:
 
     @torch.no_grad()
     def label(self, demonstrations: Demonstrations, draws: int, root_seed: int) -> Labeling:
-        """Label each demonstration by the center nearest to the mean feature of ``draws`` sub-trajectories of it.
+        """Label each demonstration by the center nearest to its feature, that of ``draws`` sub-trajectories of it.
 
         Raises DataError when the states have another dimension than those of the training set.
         """
@@ -99,8 +98,8 @@ class ClusterModel:
                 f"from states with {len(self.state_mean)}"
             )
         subtrajectories = Subtrajectories(demonstrations, self.sampling, self.state_mean, self.state_scale)
-        features = _encode_all(self.encoder, subtrajectories, draws, derive_key(root_seed, "clustering", "label"))
-        mean = normalize(features.mean(0), dim=-1)
+        features = _encode_all(self.encoder, subtrajectories, draws, _label_key(root_seed))
+        mean = self.encoder.of_demonstrations(features)
         labels = assign(mean, self.centers).numpy().astype(np.int32)
         return Labeling(labels, mean.numpy(), _stability(features, mean, self.centers))
 
@@ -122,7 +121,11 @@ class ClusterModel:
             centers, counts = torch.from_numpy(arrays["centers"]), torch.from_numpy(arrays["counts"])
             sampling = Sampling(length=int(arrays["length"][0]), stride=int(arrays["stride"][0]))
             mean, scale = arrays["state_mean"], arrays["state_scale"]
-            encoder = Encoder(len(mean), centers.shape[1], torch.Generator())
+            encoder: Encoder | States = States()
+            if any(name.startswith("lstm.") for name in arrays):
+                encoder = Encoder(len(mean), centers.shape[1], torch.Generator())
+            elif centers.shape[1] != sampling.length * len(mean):
+                raise IndexError(f"{centers.shape[1]} numbers a center, {sampling.length} states of {len(mean)}")
             encoder.load_state_dict({name: torch.from_numpy(arrays[name]) for name in encoder.state_dict()})
         except KeyError as error:
             raise ValueError(f"cluster model has no array {error.args[0]!r}") from None
@@ -136,23 +139,15 @@ class ContrastiveClustering:
 
     def __init__(self, demonstrations: Demonstrations, config: ClusteringConfig, root_seed: int) -> None:
         """Prepare the encoder. Raises DataError when there are fewer demonstrations than clusters."""
-        if len(demonstrations) < config.num_clusters:
-            raise DataError(f"{len(demonstrations)} demonstrations cannot form {config.num_clusters} clusters")
+        self._subtrajectories = Subtrajectories.plan(demonstrations, config)
         self.config = config
         self.root_seed = root_seed
         # With one cluster there is nothing for the encoder to learn.
         self._warmup = config.warmup_iterations if config.num_clusters > 1 else 0
         self.num_iterations = self._warmup + config.joint_iterations if config.num_clusters > 1 else 0
         self.iteration = 0
-        dim = demonstrations.observation_dim
-        self._state_mean, self._state_scale = np.zeros(dim, np.float32), np.ones(dim, np.float32)
-        if config.standardize_states:
-            self._state_mean, self._state_scale = standardization(demonstrations.observations)
-        self._subtrajectories = Subtrajectories(
-            demonstrations, Sampling.plan(demonstrations.lengths, config), self._state_mean, self._state_scale
-        )
         rng = torch.Generator().manual_seed(torch_seed(self._key("encoder")))
-        self.encoder = Encoder(dim, config.hidden, rng)
+        self.encoder = Encoder(demonstrations.observation_dim, config.hidden, rng)
         self._optimizer = Adam(list(self.encoder.parameters()), config.learning_rate, config.weight_decay)
         self.centers = torch.zeros(config.num_clusters, config.hidden)
         self.counts = torch.full((config.num_clusters,), config.initial_count)
@@ -184,8 +179,7 @@ class ContrastiveClustering:
 
     def model(self) -> ClusterModel:
         """Return the current encoder and centers."""
-        sampling = self._subtrajectories.sampling
-        return ClusterModel(self.encoder, self.centers, self.counts, sampling, self._state_mean, self._state_scale)
+        return _model(self.encoder, self.centers, self.counts, self._subtrajectories)
 
     def state_dict(self) -> dict[str, NDArray]:
         """Return everything that later iterations depend on."""
@@ -215,12 +209,11 @@ class ContrastiveClustering:
         config = self.config
         rng = numpy_rng(self._key("centres"))
         features = _encode_all(self.encoder, self._subtrajectories, config.label_draws, self._key("centres", "views"))
-        mean = normalize(features.mean(0), dim=-1)
+        mean = self.encoder.of_demonstrations(features)
         if config.initial_centers == "trajectories":
             centers = features[0, rng.permutation(len(mean))[: config.num_clusters]]
         else:
-            kmeans = KMeans(config.num_clusters, n_init=10, random_state=int(rng.integers(2**31)))
-            centers = torch.from_numpy(kmeans.fit(mean.numpy()).cluster_centers_)
+            centers, _ = _kmeans(mean, config.num_clusters, rng)
         if config.normalize_centers:
             centers = normalize(centers, dim=-1)
         return centers, _stability(features, mean, centers)
@@ -234,18 +227,47 @@ class ContrastiveClustering:
         return derive_key(self.root_seed, "clustering", *path)
 
 
+def clusters_of_states(demonstrations: Demonstrations, config: ClusteringConfig, root_seed: int) -> ClusterModel:
+    """Return the clusters that k-means finds in the sub-trajectories by which demonstrations are labeled.
+
+    Raises DataError when there are fewer demonstrations than clusters.
+    """
+    subtrajectories, encoder = Subtrajectories.plan(demonstrations, config), States()
+    features = encoder.of_demonstrations(_encode_all(encoder, subtrajectories, 1, _label_key(root_seed)))
+    rng = numpy_rng(derive_key(root_seed, "clustering", "states"))
+    centers, labels = _kmeans(features, config.num_clusters, rng)
+    return _model(encoder, centers, labels.bincount(minlength=config.num_clusters), subtrajectories)
+
+
+def _kmeans(features: Tensor, num_clusters: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Return (K, E) centers and (N,) labels by the best of ten runs of k-means on (N, E) features."""
+    kmeans = KMeans(num_clusters, n_init=10, random_state=int(rng.integers(2**31))).fit(features.numpy())
+    return torch.from_numpy(kmeans.cluster_centers_), torch.from_numpy(kmeans.labels_)
+
+
+def _model(
+    encoder: Encoder | States, centers: Tensor, counts: Tensor, subtrajectories: Subtrajectories
+) -> ClusterModel:
+    mean, scale = subtrajectories.state_mean, subtrajectories.state_scale
+    return ClusterModel(encoder, centers, counts, subtrajectories.sampling, mean, scale)
+
+
+def _label_key(root_seed: int) -> Key:
+    return derive_key(root_seed, "clustering", "label")
+
+
 def _stability(features: Tensor, mean: Tensor, centers: Tensor) -> float:
     """Return the share of (draws, N, E) single features whose label is that of their (N, E) mean."""
     return float((assign(features, centers) == assign(mean, centers)).double().mean())
 
 
-def _encode_all(encoder: Encoder, subtrajectories: Subtrajectories, draws: int, key: Key) -> Tensor:
+def _encode_all(encoder: Encoder | States, subtrajectories: Subtrajectories, draws: int, key: Key) -> Tensor:
     """Return (draws, N, E) features of ``draws`` sub-trajectories of every demonstration."""
     everyone = np.arange(len(subtrajectories))
     return torch.stack([_encode(encoder, subtrajectories, everyone, (*key, draw)) for draw in range(draws)])
 
 
-def _encode(encoder: Encoder, subtrajectories: Subtrajectories, chosen: NDArray[np.int64], key: Key) -> Tensor:
+def _encode(encoder: Encoder | States, subtrajectories: Subtrajectories, chosen: NDArray[np.int64], key: Key) -> Tensor:
     """Return (B, E) features of one sub-trajectory, drawn with ``key``, of each of the (B,) chosen demonstrations."""
     views = subtrajectories.draw(chosen, numpy_rng(key))
     return torch.cat([encoder(part) for part in views.split(ENCODED_AT_ONCE, dim=1)])

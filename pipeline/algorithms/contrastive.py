@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy, normalize
 
+from oodil.pipeline.algorithms.standardization import standardization
 from oodil.pipeline.config import ClusteringConfig
 from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.errors import DataError
 
 LONGEST_SUBTRAJECTORY = 50
 """In states; a recurrent encoder forgets earlier ones (appendix B)."""
@@ -79,8 +81,23 @@ class Subtrajectories:
     ) -> None:
         """Standardize the states: the (S,) mean is subtracted, the (S,) scale multiplied afterwards."""
         self.sampling = sampling
+        self.state_mean, self.state_scale = state_mean, state_scale
         self._starts, self._lengths = demonstrations.offsets[:-1], demonstrations.lengths
         self._states = torch.from_numpy((demonstrations.observations - state_mean) * state_scale)
+
+    @classmethod
+    def plan(cls, demonstrations: Demonstrations, config: ClusteringConfig) -> "Subtrajectories":
+        """Return those from which clusters are learned.
+
+        Raises DataError when there are fewer demonstrations than clusters.
+        """
+        if len(demonstrations) < config.num_clusters:
+            raise DataError(f"{len(demonstrations)} demonstrations cannot form {config.num_clusters} clusters")
+        dim = demonstrations.observation_dim
+        mean, scale = np.zeros(dim, np.float32), np.ones(dim, np.float32)
+        if config.standardize_states:
+            mean, scale = standardization(demonstrations.observations)
+        return cls(demonstrations, Sampling.plan(demonstrations.lengths, config), mean, scale)
 
     def __len__(self) -> int:
         return len(self._lengths)
@@ -103,6 +120,22 @@ class Encoder(nn.Module):
         """Return (B, E) unit features of (l, B, S) standardized states."""
         _, (hidden, _) = self.lstm(subtrajectories)
         return normalize(hidden[0], dim=-1)
+
+    def of_demonstrations(self, features: Tensor) -> Tensor:
+        """Return (N, E) unit features of demonstrations: the means of (draws, N, E) ones of their sub-trajectories."""
+        return normalize(features.mean(0), dim=-1)
+
+
+class States(nn.Module):
+    """Instead of F, the standardized states one after the other: the k-means variant of appendix C.6."""
+
+    def forward(self, subtrajectories: Tensor) -> Tensor:
+        """Return (B, l * S) features of (l, B, S) standardized states."""
+        return subtrajectories.transpose(0, 1).flatten(1)
+
+    def of_demonstrations(self, features: Tensor) -> Tensor:
+        """Return the first of (draws, N, l * S) features: a mean of states at other times is nobody's state."""
+        return features[0]
 
 
 def contrastive_loss(features: Tensor, temperature: float) -> Tensor:

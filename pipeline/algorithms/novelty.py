@@ -40,14 +40,17 @@ class Neighborhood:
             farthest = max(farthest, *(_mean_distance(tree, each) for each in here))
         self._limit = MARGIN * farthest
         self._tree = cKDTree(np.concatenate(inputs))
-        center = features.mean(axis=0)
-        self._center = center / np.linalg.norm(center)
-        self._feature_limit = MARGIN * float((1 - features @ self._center).max())
+        self._center = features.mean(axis=0)
+        self._feature_limit = MARGIN * float(self._from_center(features).max())
 
     def unlike(self, demonstrations: Demonstrations, features: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return (N,) whether transitions or (N, E) features are farther away than `MARGIN` times any member's."""
         far = [_mean_distance(self._tree, self._inputs(demonstrations, n)) for n in range(len(demonstrations))]
-        return (np.array(far) > self._limit) | (1 - features @ self._center > self._feature_limit + 1e-6)
+        return (np.array(far) > self._limit) | (self._from_center(features) > self._feature_limit + 1e-6)
+
+    def _from_center(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return (N,) halved squared distances of features from the middle of the members'."""
+        return np.asarray(np.square(features - self._center).sum(axis=1) / 2)
 
     def _inputs(self, demonstrations: Demonstrations, n: int) -> NDArray[np.float32]:
         states = demonstrations[n]

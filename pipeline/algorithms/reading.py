@@ -2,7 +2,7 @@
 
 The discriminator of a training cannot say it: it has seen every demonstration of the cluster, and lags behind the
 policy. So fresh ones are trained against the finished imitator, each on half of the demonstrations and half of the
-imitator's episodes, and read the other halves.
+imitator's episodes, and read the other halves. The paper reads that of the training (`LastDiscriminator`).
 
 Letters: N demonstrations, E episodes, R repetitions, D discriminators (two in each repetition), B batch.
 """
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from oodil.pipeline.algorithms.discriminator import Discriminator, mean_logits
+from oodil.pipeline.algorithms.discriminator import Discriminator, mean_logit_per_demonstration, mean_logits
 from oodil.pipeline.artifacts import below, nested
 from oodil.pipeline.config import DiscriminatorConfig, ReadingConfig
 from oodil.pipeline.data import Demonstrations
@@ -34,7 +34,7 @@ class Readers:
         self._demonstrations = demonstrations
         self._seed = seed
         weights = np.ones(len(demonstrations))
-        seeds = [torch_seed(derive_key(seed, "reading", "initial", d)) for d in range(2 * config.repetitions)]
+        seeds = [torch_seed(derive_key(seed, "reading", "initial", d)) for d in range(config.num_readers)]
         update = {"learning_rate": config.learning_rate, "gradient_penalty": config.gradient_penalty}
         judge = discriminator.model_copy(update=update)
         self._nets = [Discriminator(demonstrations, weights, judge, each) for each in seeds]
@@ -90,6 +90,21 @@ class Readers:
 
     def _transitions(self, demonstrations: Demonstrations) -> "_Transitions":
         return _Transitions(demonstrations, self.view)
+
+
+class LastDiscriminator:
+    """The discriminator that an imitator was trained against, as it stood last: Eqn (6)."""
+
+    def __init__(self, demonstrations: Demonstrations, config: DiscriminatorConfig, seed: int) -> None:
+        self.view = Discriminator(demonstrations, np.ones(len(demonstrations)), config, seed)
+
+    def load(self, arrays: dict[str, NDArray]) -> None:
+        """Take over its parameters."""
+        self.view.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
+
+    def divergences(self, demonstrations: Demonstrations) -> Array:
+        """Return (1, N) divergences: twice the mean logits, as if those over the imitator's episodes were opposite."""
+        return 2 * mean_logit_per_demonstration(self.view, demonstrations)[None]
 
 
 class _Transitions:

@@ -17,11 +17,11 @@ from oodil.pipeline.stage import JobContext, JobStoppedError, Run, Stage, regist
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 
 if TYPE_CHECKING:
-    from oodil.pipeline.algorithms.clustering import ContrastiveClustering, Labeling
+    from oodil.pipeline.algorithms.clustering import ClusterModel, Labeling
 
 
 class ClusteringStage(Stage):
-    """Contrastive clustering of whole demonstrations (`oodil.pipeline.algorithms.clustering`)."""
+    """Clustering of whole demonstrations (`oodil.pipeline.algorithms.clustering`)."""
 
     name = "clustering"
     version = 2
@@ -32,29 +32,31 @@ class ClusteringStage(Stage):
         return config.clustering.model_dump(mode="json")
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
-        """Train the encoder and the centers, or continue from a checkpoint, and label every demonstration.
+        """Train the encoder and the centers, or find those of the states, and label every demonstration.
 
         The artifact holds an `Assignment`, the cluster model and its `ClusterDiagnostics`.
         """
         import torch
         from threadpoolctl import threadpool_limits
 
-        from oodil.pipeline.algorithms.clustering import ContrastiveClustering
-
         torch.set_num_threads(1)
         # scikit-learn and NumPy have threads of their own, and sums depend on how many take part.
         with threadpool_limits(1):
             demonstrations = load_demonstrations(run)
-            clustering = ContrastiveClustering(demonstrations, run.config.clustering, run.config.seed)
-            self._train(clustering, run, job, context)
-            model = clustering.model()
+            model = self._model(demonstrations, run, job, context)
             labeling = model.label(demonstrations, run.config.clustering.label_draws, run.config.seed)
             shortened = model.sampling.num_shortened(demonstrations.lengths)
             found = diagnostics(labeling, demonstrations, len(model.centers), shortened)
         assignment = Assignment(labeling.labels, labeling.features)
         return assignment.files() | cluster_model_files(model.arrays()) | found.files()
 
-    def _train(self, clustering: "ContrastiveClustering", run: Run, job: str, context: JobContext) -> None:
+    def _model(self, demonstrations: Demonstrations, run: Run, job: str, context: JobContext) -> "ClusterModel":
+        """Return the clusters; those that are trained go on from a checkpoint."""
+        from oodil.pipeline.algorithms.clustering import ContrastiveClustering, clusters_of_states
+
+        if run.config.clustering.features == "states":
+            return clusters_of_states(demonstrations, run.config.clustering, run.config.seed)
+        clustering = ContrastiveClustering(demonstrations, run.config.clustering, run.config.seed)
         checkpoints = self.checkpoints(run, job)
         state, warnings = checkpoints.load()
         for warning in warnings:
@@ -71,6 +73,7 @@ class ClusteringStage(Stage):
                 saved_at = time.monotonic()
             if stop:
                 raise JobStoppedError
+        return clustering.model()
 
 
 def diagnostics(

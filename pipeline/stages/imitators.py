@@ -22,7 +22,7 @@ from oodil.pipeline.stages.demonstrations import load_demonstrations
 if TYPE_CHECKING:
     from oodil.pipeline.algorithms.gail import AdversarialReward
     from oodil.pipeline.algorithms.learner import Learner
-    from oodil.pipeline.algorithms.reading import Readers
+    from oodil.pipeline.algorithms.reading import LastDiscriminator, Readers
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,13 @@ class ClusterJob:
         dims = spec.observation_dim, spec.action_dim, spec.max_episode_steps
         return imitator(*dims, self.demonstrations, np.ones(len(self.members)), config.transferability.gail, self.seed)
 
-    def readers(self, config: RunConfig) -> "Readers":
-        """Return untrained discriminators that are to read the demonstrations."""
-        from oodil.pipeline.algorithms.reading import Readers
+    def readers(self, config: RunConfig) -> "Readers | LastDiscriminator":
+        """Return what is to read the demonstrations; it is still untrained."""
+        from oodil.pipeline.algorithms.reading import LastDiscriminator, Readers
 
         section = config.transferability
+        if section.reading.discriminator == "last":
+            return LastDiscriminator(self.demonstrations, section.gail.discriminator, self.seed)
         return Readers(self.demonstrations, section.gail.discriminator, section.reading, self.seed)
 
 

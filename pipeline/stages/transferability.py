@@ -46,11 +46,17 @@ class TransferabilityStage(Weighting):
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return how the imitators are read."""
-        return {"reading": config.transferability.reading.model_dump()}
+        section = config.transferability.reading
+        reader = {"discriminator": section.discriminator}
+        if section.discriminator == "last":
+            return reader  # The other fields are about fresh ones alone.
+        return reader | {"reading": section.model_dump(exclude={"discriminator"})}
 
     def rule(self, config: RunConfig) -> str:
         """Say what is kept."""
         share = config.transferability.kept_from
+        if share == 0:
+            return super().rule(config)
         return f"{super().rule(config)}, if the whole interval reaches {share:.0%} of the best cluster's score"
 
     def jobs(self, run: Run) -> list[str]:
@@ -58,10 +64,17 @@ class TransferabilityStage(Weighting):
         return ImitatorsStage().jobs(run)
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
-        """Read the demonstrations of a cluster against fresh episodes of its imitator."""
+        """Read the demonstrations of a cluster against fresh episodes of its imitator, or by its own discriminator."""
+        from oodil.pipeline.algorithms.reading import LastDiscriminator
+
         cluster = ClusterJob.of(run, job)
         imitator = Imitator.load(run.job_artifact(ImitatorsStage.name, job))
-        readers, played = cluster.readers(run.config), self._episodes(run.config, cluster, imitator.policy)
+        readers = cluster.readers(run.config)
+        if isinstance(readers, LastDiscriminator):
+            readers.load(imitator.discriminator)
+            divergences = readers.divergences(cluster.demonstrations)
+            return Reading(cluster.members, divergences, env_steps=0, readers=imitator.discriminator).files()
+        played = self._episodes(run.config, cluster, imitator.policy)
         divergences = readers.train(played, context.progress)
         return Reading(cluster.members, divergences, int((played.lengths - 1).sum()), readers.arrays()).files()
 
@@ -74,7 +87,8 @@ class TransferabilityStage(Weighting):
     def combine(self, run: Run) -> Files:
         """Take each cluster's closest imitator and turn its readings into scores, verdicts and weights."""
         demonstrations, section = load_demonstrations(run), run.config.transferability
-        divergences = np.empty((section.reading.repetitions, len(demonstrations)))
+        fresh = section.reading.discriminator == "fresh"
+        divergences = np.empty((section.reading.repetitions if fresh else 1, len(demonstrations)))
         history, read_from, env_steps = {}, {}, 0
         for cluster, jobs in self._by_cluster(run).items():
             env_steps += sum(Reading.load(run.job_artifact(self.name, job)).env_steps for job in jobs)
@@ -85,9 +99,9 @@ class TransferabilityStage(Weighting):
         labels = load_assignment(run).labels
         readings = self._readings(run.config, demonstrations, divergences)
         best = max(float(readings[:, labels == cluster].mean()) for cluster in history)
-        threshold = section.kept_from * best
-        found = self._judged(readings, labels, threshold)
-        found.intervals[np.bincount(labels)[labels] == 1] = 0, 1  # Its readers have seen it, and there is no other.
+        found = self._judged(run.config, readings, labels, section.kept_from * best)
+        if fresh:
+            found.intervals[np.bincount(labels)[labels] == 1] = 0, 1  # Its readers have seen it, and there is no other.
         return replace(found, env_steps=env_steps, read_from=read_from, history=history).files()
 
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
@@ -104,7 +118,7 @@ class TransferabilityStage(Weighting):
         labeled = model.label(demonstrations, run.config.clustering.label_draws, run.config.seed)
         labels, assignment, known = labeled.labels, load_assignment(run), load_demonstrations(run)
         unlike = ~np.isin(labels, assignment.labels)
-        divergences = np.full((2 * run.config.transferability.reading.repetitions, len(demonstrations)), np.inf)
+        divergences = np.full((run.config.transferability.reading.num_readers, len(demonstrations)), np.inf)
         read_from = self.load(run).read_from
         for cluster in set(np.unique(labels).tolist()) & set(read_from):
             job = read_from[cluster]
@@ -118,7 +132,7 @@ class TransferabilityStage(Weighting):
             unlike[new] = around.unlike(chosen, labeled.features[new])
         readings = self._readings(run.config, demonstrations, divergences)
         readings[:, unlike] = np.nan
-        return self._judged(readings, labels, self.load(run).threshold)
+        return self._judged(run.config, readings, labels, self.load(run).threshold)
 
     def _by_cluster(self, run: Run) -> dict[int, list[str]]:
         """Return the jobs of each cluster that has demonstrations."""
@@ -136,8 +150,10 @@ class TransferabilityStage(Weighting):
         horizon = environment_spec(environment.id, environment.dynamics).max_episode_steps
         return transferability_of_divergences(divergences) * share_lasted(demonstrations, horizon)
 
-    def _judged(self, readings: np.ndarray, labels: np.ndarray, threshold: float) -> Transferability:
-        scores, limits = readings.mean(axis=0), intervals(readings)
+    def _judged(self, config: RunConfig, readings: np.ndarray, labels: np.ndarray, threshold: float) -> Transferability:
+        scores = readings.mean(axis=0)
+        single = config.transferability.reading.discriminator == "last"
+        limits = np.stack((scores, scores), axis=1) if single else intervals(readings)
         return Transferability(scores, kept_weights(scores, limits, threshold), labels, limits, threshold)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from sklearn.cluster import KMeans
 from sklearn.metrics import calinski_harabasz_score, silhouette_score
 
 from oodil.pipeline.algorithms.clustering import (
@@ -15,13 +16,14 @@ from oodil.pipeline.algorithms.clustering import (
     Labeling,
     assign,
     center_loss,
+    clusters_of_states,
     moved_centers,
 )
 from oodil.pipeline.artifacts import RunDirectory, write_artifact
 from oodil.pipeline.config import ClusteringConfig, RunConfig
-from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.errors import DataError
-from oodil.pipeline.results import ClusterDiagnostics
+from oodil.pipeline.results import Assignment, ClusterDiagnostics
 from oodil.pipeline.stage import JobStoppedError, Run
 from oodil.pipeline.stages import clustering as stage_module
 from oodil.pipeline.stages.clustering import ClusteringStage, contingency, diagnostics, purity
@@ -316,3 +318,58 @@ def test_a_mode_with_few_members_keeps_a_cluster_of_its_own():
         clustering.update()
     labels = clustering.model().label(demonstrations, draws=5, root_seed=0).labels
     assert not set(labels[:4]) & set(labels[4:])
+
+
+def test_states_are_standardized_one_after_the_other_and_clustered_by_k_means():
+    """Demonstrations of l states leave no choice of a sub-trajectory."""
+    rng = np.random.default_rng(0)
+    states = (rng.normal(size=(12, 5, 2)) * (1, 100) + np.repeat([0, 9, 20], 4)[:, None, None]).astype(np.float32)
+    made = Demonstrations.of([Episode(each) for each in states], "made")
+    model = clusters_of_states(made, ClusteringConfig(features="states", subtrajectory_length=5, num_clusters=3), 0)
+    labeling = model.label(made, draws=3, root_seed=0)
+
+    flat = ((states - states.mean(axis=(0, 1))) / states.std(axis=(0, 1))).reshape(12, 10)
+    np.testing.assert_allclose(labeling.features, flat, rtol=1e-4, atol=1e-5)
+    expected = KMeans(3, n_init=10, random_state=1).fit(flat)
+    assert sorted(map(tuple, model.centers.numpy().round(3))) == sorted(
+        map(tuple, expected.cluster_centers_.round(3).astype(np.float32))
+    )
+    np.testing.assert_array_equal(np.bincount(labeling.labels, minlength=3), model.counts.numpy())
+    assert labeling.stability == 1
+
+
+def test_states_of_every_stride_th_moment_say_which_dynamics_it_is(make_run):
+    run = make_run("states", features="states", num_clusters=3)
+    context = Context()
+    files = STAGE.run_job(run, "clustering", context)
+    artifact = write_artifact(run.directory.stage("clustering"), STAGE.origin(run), files)
+    assert context.reports == [], "nothing is trained"
+    assert files == STAGE.run_job(make_run("again", features="states", num_clusters=3), "clustering", Context())
+
+    demonstrations, assignment = stage_module.load_demonstrations(run), Assignment.load(artifact)
+    assert assignment.features.shape == (20, 20 * 2)
+    rebuilt = ClusterModel.from_arrays(artifact.arrays("encoder.safetensors"))
+    np.testing.assert_array_equal(rebuilt.label(demonstrations, 1, root_seed=0).labels, assignment.labels)
+    report = ClusterDiagnostics.load(artifact)
+    assert sum(report.cluster_sizes) == 20 and report.silhouette is not None
+    assert report.label_stability < 1, "sub-trajectories with other phases fall into other clusters"
+    with pytest.raises(ValueError, match="do not fit together: 40 numbers a center, 19 states of 2"):
+        ClusterModel.from_arrays(rebuilt.arrays() | {"length": np.array([19], np.int32)})
+
+
+def test_modes_that_lie_apart_are_found_in_states_and_in_new_demonstrations():
+    known, new = leaning((4, 8, 8)), leaning((5, 5, 5), seed=1)
+    model = clusters_of_states(known, ClusteringConfig(features="states", num_clusters=3), 0)
+    labels = model.label(known, 1, root_seed=0).labels
+    owner = contingency(labels, known.sources, 3, 3).argmax(axis=0)
+    assert (owner[labels] == known.sources).all()
+    assert (owner[model.label(new, 1, root_seed=0).labels] == new.sources).all()
+
+
+def test_one_cluster_of_states_takes_everything_and_more_clusters_than_demonstrations_are_refused():
+    made = three_dynamics((2, 2, 2))
+    one = clusters_of_states(made, ClusteringConfig(features="states", num_clusters=1), 0)
+    assert not one.label(made, 5, 0).labels.any()
+    assert one.counts.tolist() == [6]
+    with pytest.raises(DataError, match="6 demonstrations cannot form 7 clusters"):
+        clusters_of_states(made, ClusteringConfig(features="states", num_clusters=7), 0)

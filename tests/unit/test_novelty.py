@@ -56,3 +56,12 @@ def test_a_feature_far_from_those_of_the_members_is_unlike():
     view = Discriminator(members, np.ones(9), DiscriminatorConfig(), 0)
     other = np.array([[1.0, 0.0], [0.0, 1.0]], np.float32)
     assert Neighborhood(members, features(9), view).unlike(circles(2, 1), other).tolist() == [False, True]
+
+
+def test_features_need_not_have_length_one():
+    """Members lie 1 and 3 from their middle, so the limit is 1.5 times 3 squared, by halves: 3.67 from it."""
+    members = circles(4, 0)
+    view = Discriminator(members, np.ones(4), DiscriminatorConfig(), 0)
+    around = Neighborhood(members, np.array([[9.0, 0], [11, 0], [10, 3], [10, -3]], np.float32), view)
+    new = np.array([[10.0, 3.6], [10, 3.8], [1, 0]], np.float32)
+    assert around.unlike(circles(4, 0).select(np.arange(3)), new).tolist() == [False, True, True]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from oodil.pipeline.algorithms.discriminator import Discriminator
-from oodil.pipeline.algorithms.reading import Readers
+from oodil.pipeline.algorithms.reading import LastDiscriminator, Readers
 from oodil.pipeline.algorithms.weights import transferability_of_divergences
 from oodil.pipeline.config import DiscriminatorConfig, ReadingConfig
 from oodil.pipeline.data import Demonstrations, Episode
@@ -72,3 +72,20 @@ def test_each_repetition_draws_other_halves(repetitions):
     found = readers(walks(6, 0), config).train(walks(8, 1))
     assert found.shape == (repetitions, 6)
     assert len(np.unique(found[:, 0])) == repetitions
+
+
+def test_the_last_discriminator_reads_eqn_6(demonstrations):
+    """The score is twice the probability that a demonstration is the imitator's, by its mean logit, and at most 1."""
+    made = demonstrations(4, 9, 3)
+    config = DiscriminatorConfig(view="raw", hidden=(8,))
+    trained = Discriminator(made, np.ones(3), config, seed=3)
+    trained.net.layers[-1].weight.data.mul_(30)
+    reader = LastDiscriminator(made, config, seed=0)
+    reader.load({name: value.numpy() for name, value in trained.state_dict().items()})
+    logits = []
+    for n in range(3):
+        states = made[n]
+        logits.append(float(trained(trained.inputs(states[:-1], states[1:])).detach().mean()))
+    expected = [min(1, 2 / (1 + np.exp(logit))) for logit in logits]
+    np.testing.assert_allclose(transferability_of_divergences(reader.divergences(made)), [expected], rtol=1e-5)
+    assert len(set(expected)) > 1
