@@ -1,8 +1,8 @@
 """Feasibility of demonstrations from how far a policy that tracks them stays from each.
 
-Cao and Sadigh, *Learning from Imperfect Demonstrations from Agents with Varying Dynamics* (RA-L 2021),
-https://arxiv.org/abs/2103.05910, as the paper's baseline f-MDP. The released code cuts a tenth off either end of
-distances that it has not sorted; here they are sorted.
+Cao, Hao, Li and Sadigh, *Learning Feasibility to Imitate Demonstrators with Different Dynamics* (CoRL 2021),
+https://openreview.net/forum?id=MWtinPDqfZg: the paper's baseline f-MDP. Where alpha adapts, the released code cuts a
+tenth off either end of distances that it has not sorted; here they are sorted.
 
 Letters: N demonstrations.
 """

@@ -30,7 +30,8 @@ def test_a_run_that_was_stopped_in_each_training_gives_the_same_bits(results: Ru
     path = tmp_path / "run"
     for stage, job, iteration in (("feasibility", "shared", 3), ("feasibility_per_source", "source-1", 2)):
         with pytest.raises(UnfinishedError):
-            oodil.run(MICRO, OVERRIDES, workers=0, run_dir=path, should_stop=has_checkpoint(path, stage, job, iteration))
+            stop = has_checkpoint(path, stage, job, iteration)
+            oodil.run(MICRO, OVERRIDES, workers=0, run_dir=path, should_stop=stop)
         stopped = oodil.open_run(path).run
         assert not stopped.directory.job(stage, job).exists()
     oodil.run(MICRO, OVERRIDES, workers=0, run_dir=path)
@@ -75,7 +76,7 @@ def test_it_appears_in_summary_and_report(results: RunResults) -> None:
     summary = results.summary()
     assert {"imitation", "f_mdp", "f_mdp_per_source"} == summary["policies"].keys()
     assert set(WEIGHTINGS) < summary["weightings"].keys()
-    page = Path(oodil.write_report(results.run.directory.path)).read_text()
+    page = Path(oodil.write_report(results)).read_text()
     assert "f-MDP, one policy per source" in page
 
 

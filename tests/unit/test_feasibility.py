@@ -14,7 +14,7 @@ from tests.unit.test_config import values
 
 def test_feasibility_by_hand() -> None:
     found = feasibility(np.array([2.0, 7.0, 12.0, 252.0, 999.0, 1.0]), nearest=2.0, alpha=5.0)
-    # Differences 0, 5, 10 are 0, 1 and 2 alphas; 250 and 997 are cut at 50 of them; what is nearer than the nearest is 1.
+    # Differences of 0, 5 and 10 are 0, 1 and 2 alphas; 250 and 997 are cut at 50 of them; nearer than the nearest is 1.
     np.testing.assert_allclose(found, np.exp([0.0, -1.0, -2.0, -50.0, -50.0, 0.0]), rtol=1e-12)
 
 
