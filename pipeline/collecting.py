@@ -62,7 +62,11 @@ def begin(simulators: Simulators, simulator: int, rng: np.random.Generator, star
 
 def collect(unit: Unit) -> UnitResult:
     """Run one env group for ``num_steps`` steps; the result depends on nothing but ``unit``."""
-    simulators = _simulators(unit)
+    return collect_in(_simulators(unit), unit)
+
+
+def collect_in(simulators: Simulators, unit: Unit) -> UnitResult:
+    """Run a unit in simulators of the caller's own kind, wherever they stand."""
     rng = numpy_rng(unit.key)
     shape = (unit.num_steps, unit.num_simulators)
     noise = rng.standard_normal((*shape, simulators.action_dim), dtype=np.float32)
@@ -117,7 +121,8 @@ def collect(unit: Unit) -> UnitResult:
 class InlineRollouts:
     """A rollout source that collects in the learner's own process, one unit after another."""
 
-    def __init__(self) -> None:
+    def __init__(self, collect: Callable[[Unit], UnitResult] = collect) -> None:
+        self._collect = collect
         self._units: deque[Unit] = deque()
 
     def submit(self, units: list[Unit]) -> None:
@@ -129,7 +134,7 @@ class InlineRollouts:
         results: list[UnitResult] = []
         first = self._units[0].iteration
         while self._units and self._units[0].iteration == first:
-            result = collect(self._units.popleft())
+            result = self._collect(self._units.popleft())
             results.append(result)
             self.submit(follow(result))
         return results

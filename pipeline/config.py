@@ -345,6 +345,19 @@ class ReproducibilityConfig(_Section):
     """Gauss-Newton steps with which each action is sought."""
 
 
+class FeasibilityConfig(_Section):
+    """The competing method f-MDP: policies that track demonstrations and learn as the imitators of clusters do, with as
+    many environment steps in all."""
+
+    discount: float = Field(default=0.9, gt=0.0, le=1.0)
+    """By which each further step of a demonstration counts less."""
+    steps_per_iteration: PositiveInt = 15_000
+    """Environment steps of an update, rounded up to whole episodes of the longest demonstration."""
+    alpha: PositiveFloat | None = None
+    """The difference of two distances that divides feasibility by e, in units of the observations; the released code
+    has 5 for locomotion. Null: distances are in deviations over the demonstrations, and their own spread decides."""
+
+
 class ImitationConfig(_Section):
     """The final policy, and every baseline."""
 
@@ -440,11 +453,13 @@ class RunConfig(_Section):
     """What the imitator can reproduce."""
     reproducibility: ReproducibilityConfig | None = None
     """A physical check of the demonstrations, beside the method; without this section there is none."""
+    f_mdp: FeasibilityConfig = FeasibilityConfig()
+    """How the baselines `f_mdp` and `f_mdp_per_source` weigh demonstrations."""
     imitation: ImitationConfig
     """The final policy."""
     baselines: tuple[str, ...] = ()
-    """Policies that are trained beside it for comparison: `naive_gail`, `oracle`, or `module:name` for one that another
-    module registers."""
+    """Policies that are trained beside it for comparison: `naive_gail`, `oracle`, `f_mdp`, `f_mdp_per_source`, or
+    `module:name` for one that another module registers."""
     evaluation: EvaluationConfig = EvaluationConfig()
     """What is measured beside the training."""
     runtime: RuntimeConfig = RuntimeConfig()

@@ -25,6 +25,7 @@ _POLICY, _POLICY_META, _DISCRIMINATOR = "policy.safetensors", "policy.json", "di
 _CURVE, _EVALUATION = "curve.json", "evaluation.json"
 _IMITATORS, _JOB_SCORES, _TRAININGS = "imitators.json", "scores.safetensors", "trainings.json"
 _RESIDUALS, _DISTANCE = "residuals.safetensors", "distance.json"
+_TRACKED, _FEASIBILITY = "tracked.safetensors", "feasibility.json"
 _DIVERGENCES, _READING, _READERS = "divergences.safetensors", "reading.json", "readers.safetensors"
 
 Arrays = dict[str, NDArray[Any]]
@@ -285,6 +286,46 @@ class TrainedImitators:
     def load(cls, artifact: Artifact) -> Self:
         """Read an artifact."""
         return cls(**artifact.json(_IMITATORS))
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """A policy that tracks demonstrations, and how far it stays from each."""
+
+    policy: GaussianPolicy
+    demonstrations: NDArray[np.int64]
+    """(N_k,) which of all demonstrations it was trained on."""
+    distances: NDArray[np.float64]
+    """(N_k,) see `tracking.distances`."""
+
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        tracked: Arrays = {"demonstrations": self.demonstrations, "distances": self.distances}
+        return {_POLICY: encode_arrays(self.policy.arrays()), _TRACKED: encode_arrays(tracked)}
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        return cls(_policy(artifact), **artifact.arrays(_TRACKED))
+
+
+@dataclass(frozen=True)
+class FeasibilityScale:
+    """What turns the distance of a tracked demonstration into its feasibility."""
+
+    nearest: float
+    """The smallest distance of the run's demonstrations."""
+    alpha: float
+    """The difference of two distances that divides feasibility by e."""
+
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        return {_FEASIBILITY: encode_json(vars(self))}
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        return cls(**artifact.json(_FEASIBILITY))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from oodil.pipeline.algorithms.learner import Learner
 from oodil.pipeline.artifacts import Checkpoints, below, nested
-from oodil.pipeline.collecting import nothing_follows
+from oodil.pipeline.collecting import RolloutSource, nothing_follows
 from oodil.pipeline.config import EnvironmentConfig, TrainingConfig
 from oodil.pipeline.data import Snapshot, TransitionBatch, Unit, UnitResult
 from oodil.pipeline.policy import GaussianPolicy
@@ -115,10 +115,12 @@ def train(
     context: JobContext,
     checkpoints: Checkpoints,
     starts: NDArray[np.float32] | None = None,
+    rollouts: RolloutSource | None = None,
 ) -> History:
     """Train for the configured number of steps, from the newest checkpoint if there is one.
 
-    Episodes begin at ``starts`` (P, S), if there are any; see `Unit`.
+    Episodes begin at ``starts`` (P, S), if there are any; see `Unit`. Whoever collects for the context does so unless
+    other ``rollouts`` are given.
 
     Each iteration reports to the context the metrics of `Learner.update`, and the mean ``return`` and ``length`` of the
     last hundred episodes of training once one has ended.
@@ -127,6 +129,7 @@ def train(
     """
     torch.set_num_threads(config.torch_threads)
     position = _resume(learner, config, context, checkpoints, starts)
+    source = context.rollouts if rollouts is None else rollouts
 
     def unit(group: int) -> Unit:
         return position.unit(group, learner.root_seed, environment, config)
@@ -138,20 +141,20 @@ def train(
     last_checkpoint = time.monotonic()
     returns, lengths = _Recent(), _Recent()
     if position.iteration < config.num_iterations:
-        context.rollouts.submit([unit(group) for group in range(config.num_groups)])
+        source.submit([unit(group) for group in range(config.num_groups)])
     for iteration in range(position.iteration, config.num_iterations):
         is_last = iteration + 1 == config.num_iterations
         position.iteration = iteration + 1
         if config.lag == 1:
             position.policy, position.policy_version = learner.behavior_policy(), iteration
-        results = context.rollouts.gather(follow if config.lag == 1 and not is_last else nothing_follows)
+        results = source.gather(follow if config.lag == 1 and not is_last else nothing_follows)
         batch = TransitionBatch.of([result.rollout for result in results])
         position.snapshots = [result.snapshot for result in results]
         metrics = learner.update(batch, iteration)
         if config.lag == 0:
             position.policy, position.policy_version = learner.behavior_policy(), position.iteration
             if not is_last:
-                context.rollouts.submit([unit(group) for group in range(config.num_groups)])
+                source.submit([unit(group) for group in range(config.num_groups)])
         _refuse_divergence(metrics, iteration)
 
         env_steps = position.iteration * config.steps_per_iteration

@@ -69,6 +69,16 @@ def check_environment(env_id: str, dynamics: Mapping[str, float]) -> Environment
     return environment_spec(env_id, dynamics)
 
 
+def why_unplaceable(env_id: str, dynamics: Mapping[str, float]) -> str:
+    """Return why an environment cannot be put into the states that are observed of it; empty if it can."""
+    if not environment_spec(env_id, dynamics).can_be_placed:
+        return unplaceable(env_id)
+    simulators = make_batch(env_id, dynamics, 1)
+    if not simulators.tells_state(simulators.observations()).all():
+        return f"what is observed of environment {env_id!r} does not tell its state"
+    return ""
+
+
 def _make(env_id: str, dynamics: Mapping[str, float]) -> tuple[gymnasium.Env[Any, Any], int]:
     """Return an environment and its time limit in steps."""
     stop_the_clock()
@@ -90,4 +100,4 @@ def _make(env_id: str, dynamics: Mapping[str, float]) -> tuple[gymnasium.Env[Any
     return env, limit
 
 
-__all__ = ["EnvironmentSpec", "Simulators", "check_environment", "environment_spec", "make_batch", "unplaceable"]
+__all__ = ["EnvironmentSpec", "Simulators", "check_environment", "environment_spec", "make_batch", "why_unplaceable"]

@@ -12,7 +12,7 @@ import numpy as np
 from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import EnvironmentConfig, ReproducibilityConfig, RunConfig
 from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.environments import environment_spec, make_batch, unplaceable
+from oodil.pipeline.environments import environment_spec, make_batch, why_unplaceable
 from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.reproducibility import Follower, deviations
 from oodil.pipeline.results import Reproducibility
@@ -35,12 +35,8 @@ class ReproducibilityStage(Stage):
 
     def check(self, config: RunConfig) -> None:
         """Raise ConfigError for an environment that cannot be put into a state, or shows none to put it into."""
-        env_id, dynamics = config.environment.id, config.environment.dynamics
-        if not environment_spec(env_id, dynamics).can_be_placed:
-            raise ConfigError(f"reproducibility: {unplaceable(env_id)}")
-        simulators = make_batch(env_id, dynamics, 1)
-        if not simulators.tells_state(simulators.observations()).all():
-            raise ConfigError(f"reproducibility: what is observed of environment {env_id!r} does not tell its state")
+        if reason := why_unplaceable(config.environment.id, config.environment.dynamics):
+            raise ConfigError(f"reproducibility: {reason}")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the imitator's environment and what the trials depend on."""
