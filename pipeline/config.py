@@ -320,7 +320,8 @@ class TransferabilityConfig(_Section):
 
 class ReproducibilityConfig(_Section):
     """How closely the imitator's simulator can follow the demonstrations, by physics and without learning. Nothing
-    else depends on it. The environment has to be one that can be put into an observed state."""
+    else depends on it but the policy `exact_id`. The environment has to be one that can be put into an observed
+    state."""
 
     transitions: PositiveInt = 8
     """Trials of each demonstration."""
@@ -328,6 +329,28 @@ class ReproducibilityConfig(_Section):
     """Steps that a trial follows it."""
     iterations: PositiveInt = 4
     """Gauss-Newton steps with which each action is sought."""
+
+
+class InverseDynamicsConfig(_Section):
+    """The competing method ID, behind the policies `id_random` and `id_gail`: an inverse model, learned from
+    exploration, follows each demonstration in the imitator's simulator. The environment has to be one that can be put
+    into an observed state."""
+
+    transitions: PositiveInt = 100_000
+    """Of exploration; rounded up to whole rollouts."""
+    held_out: float = Field(default=0.1, gt=0.0, lt=1.0)
+    """Share of them, in whole episodes, that the model does not learn from: how far it stays behind these is what
+    demonstrations are measured by."""
+    hidden: PositiveInt = 100
+    """Width of the network."""
+    blocks: PositiveInt = 6
+    """Residual blocks."""
+    learning_rate: PositiveFloat = 0.01
+    """Adam's step size."""
+    batch_size: PositiveInt = 128
+    """Transitions per gradient step."""
+    passes: PositiveInt = 10
+    """Over the transitions that the model learns from."""
 
 
 class ImitationConfig(_Section):
@@ -389,12 +412,15 @@ class RunConfig(_Section):
     transferability: TransferabilityConfig
     """What the imitator can reproduce."""
     reproducibility: ReproducibilityConfig | None = None
-    """A physical check of the demonstrations, beside the method; without this section there is none."""
+    """A physical check of the demonstrations, beside the method; without this section there is none, unless `exact_id`
+    asks for it."""
+    inverse_dynamics: InverseDynamicsConfig = InverseDynamicsConfig()
+    """The competing method ID, for runs that have `id_random` or `id_gail` among their baselines."""
     imitation: ImitationConfig
     """The final policy."""
     baselines: tuple[str, ...] = ()
-    """Policies that are trained beside it for comparison: `naive_gail`, `oracle`, or `module:name` for one that another
-    module registers."""
+    """Policies that are trained beside it for comparison: `naive_gail`, `oracle`, `id_random`, `id_gail`, `exact_id`,
+    or `module:name` for one that another module registers."""
     evaluation: EvaluationConfig = EvaluationConfig()
     """What is measured beside the training."""
     runtime: RuntimeConfig = RuntimeConfig()
