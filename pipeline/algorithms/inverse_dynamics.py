@@ -7,6 +7,7 @@ environment takes them, within their range, and no noise is added to those that 
 Letters: M transitions, N demonstrations, G simulators, B batch, S observation, A action.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.functional import smooth_l1_loss
+from torch.nn.functional import linear, smooth_l1_loss
 
 from oodil.pipeline.algorithms.optimizer import Adam
 from oodil.pipeline.algorithms.standardization import standardization
@@ -28,9 +29,6 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Bounds = tuple[NDArray[np.float32], NDArray[np.float32]]
 """The (A,) lowest and highest action."""
-
-ROWS = 16
-"""Rows that the network takes at a time when it acts: how a product of matrices is rounded depends on their number."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ class Exploration:
 
     @classmethod
     def of(cls, batch: TransitionBatch, bounds: Bounds, share: float, key: Key) -> "Exploration":
-        """Cut experience into episodes and hold out some, drawn by ``key``, that make up at least ``share`` of it.
+        """Cut experience into episodes and hold out some, drawn by ``key``, until they make up ``share`` of it.
 
         Episodes that the experience breaks off are learned from, and held out only if there is no other.
         """
@@ -100,14 +98,18 @@ class InverseModel(nn.Module):
             nn.init.uniform_(layer.bias, -bound, bound, generator=rng)
         self._adam = Adam(list(self.parameters()), config.learning_rate)
 
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Return (B, A) actions for (B, 2S) states and changes."""
-        hidden = torch.relu(self.first((inputs - self.input_mean) * self.input_scale))
+    def forward(self, inputs: Tensor, product: Callable[[Tensor, Tensor, Tensor], Tensor] = linear) -> Tensor:
+        """Return (B, A) actions for (B, 2S) states and changes; ``product`` computes a layer from weight and bias."""
+
+        def layer(module: nn.Module, values: Tensor) -> Tensor:
+            assert isinstance(module, nn.Linear)
+            return product(values, module.weight, module.bias)
+
+        hidden = torch.relu(layer(self.first, (inputs - self.input_mean) * self.input_scale))
         for block in self.blocks:
             # h <- relu(h + relu(W h))
-            hidden = torch.relu(hidden + torch.relu(block(hidden)))
-        output: Tensor = self.last(hidden)
-        return output
+            hidden = torch.relu(hidden + torch.relu(layer(block, hidden)))
+        return layer(self.last, hidden)
 
     def learn(self, exploration: Exploration, number: int) -> float:
         """Pass over the transitions once, for the ``number``-th time from 0, and return the mean smooth L1 loss."""
@@ -131,10 +133,7 @@ class InverseModel(nn.Module):
     @torch.no_grad()
     def act(self, states: Floats, wanted: Floats) -> NDArray[np.float32]:
         """Return (G, A) actions that are to lead from (G, S) states to the wanted ones, not yet within their range."""
-        inputs = _inputs(states, wanted)
-        full = torch.zeros(-(-len(inputs) // ROWS) * ROWS, inputs.shape[1])
-        full[: len(inputs)] = inputs
-        return torch.cat([self(rows) for rows in full.split(ROWS)])[: len(inputs)].numpy()
+        return np.asarray(self(_inputs(states, wanted), _row_by_row).numpy())
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
         """Return what `act` needs; `load` is the inverse."""
@@ -196,3 +195,9 @@ def error_bounds(errors: Floats, held_out: Floats) -> tuple[float, float]:
 def _inputs(states: NDArray[np.floating], next_states: NDArray[np.floating]) -> Tensor:
     """Return (B, 2S) states and the changes to the next ones."""
     return torch.from_numpy(np.concatenate((states, next_states - states), axis=1).astype(np.float32))
+
+
+def _row_by_row(values: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Return what `linear` does, rounded in the same way whichever rows are beside a row."""
+    rows = np.einsum("bi,io->bo", values.numpy(), np.ascontiguousarray(weight.numpy().T))
+    return torch.from_numpy(rows + bias.numpy())

@@ -253,6 +253,7 @@ def _bounds(spec: EnvironmentSpec) -> tuple[NDArray[np.float32], NDArray[np.floa
 
 
 def _refuse_other_states(run: Run, demonstrations: Demonstrations) -> None:
+    """Raise DataError for states of another dimension."""
     known = load_demonstrations(run).observation_dim
     if demonstrations.observation_dim != known:
         raise DataError(
