@@ -335,7 +335,8 @@ class TransferabilityConfig(_Section):
 
 class ReproducibilityConfig(_Section):
     """How closely the imitator's simulator can follow the demonstrations, by physics and without learning. Nothing
-    else depends on it. The environment has to be one that can be put into an observed state."""
+    else depends on it but the policy `exact_id`. The environment has to be one that can be put into an observed
+    state."""
 
     transitions: PositiveInt = 8
     """Trials of each demonstration."""
@@ -356,6 +357,28 @@ class FeasibilityConfig(_Section):
     alpha: PositiveFloat | None = None
     """The difference of two distances that divides feasibility by e, in units of the observations; the released code
     has 5 for locomotion. Null: distances are in deviations over the demonstrations, and their own spread decides."""
+
+
+class InverseDynamicsConfig(_Section):
+    """The competing method ID, behind the policies `id_random` and `id_gail`: an inverse model, learned from
+    exploration, follows each demonstration in the imitator's simulator. The environment has to be one that can be put
+    into an observed state."""
+
+    transitions: PositiveInt = 100_000
+    """Of exploration; rounded up to whole rollouts."""
+    held_out: float = Field(default=0.1, gt=0.0, lt=1.0)
+    """Share of them, in whole episodes, that the model does not learn from: how far it stays behind these is what
+    demonstrations are measured by."""
+    hidden: PositiveInt = 100
+    """Width of the network."""
+    blocks: PositiveInt = 6
+    """Residual blocks."""
+    learning_rate: PositiveFloat = 0.01
+    """Adam's step size."""
+    batch_size: PositiveInt = 128
+    """Transitions per gradient step."""
+    passes: PositiveInt = 10
+    """Over the transitions that the model learns from."""
 
 
 class ImitationConfig(_Section):
@@ -452,14 +475,17 @@ class RunConfig(_Section):
     transferability: TransferabilityConfig
     """What the imitator can reproduce."""
     reproducibility: ReproducibilityConfig | None = None
-    """A physical check of the demonstrations, beside the method; without this section there is none."""
+    """A physical check of the demonstrations, beside the method; without this section there is none, unless `exact_id`
+    asks for it."""
     f_mdp: FeasibilityConfig = FeasibilityConfig()
     """How the baselines `f_mdp` and `f_mdp_per_source` weigh demonstrations."""
+    inverse_dynamics: InverseDynamicsConfig = InverseDynamicsConfig()
+    """The competing method ID, for runs that have `id_random` or `id_gail` among their baselines."""
     imitation: ImitationConfig
     """The final policy."""
     baselines: tuple[str, ...] = ()
-    """Policies that are trained beside it for comparison: `naive_gail`, `oracle`, `f_mdp`, `f_mdp_per_source`, or
-    `module:name` for one that another module registers."""
+    """Policies that are trained beside it for comparison: `naive_gail`, `oracle`, `f_mdp`, `f_mdp_per_source`,
+    `id_random`, `id_gail`, `exact_id`, or `module:name` for one that another module registers."""
     evaluation: EvaluationConfig = EvaluationConfig()
     """What is measured beside the training."""
     runtime: RuntimeConfig = RuntimeConfig()

@@ -26,6 +26,7 @@ _CURVE, _EVALUATION = "curve.json", "evaluation.json"
 _IMITATORS, _JOB_SCORES, _TRAININGS = "imitators.json", "scores.safetensors", "trainings.json"
 _RESIDUALS, _DISTANCE = "residuals.safetensors", "distance.json"
 _TRACKED, _FEASIBILITY = "tracked.safetensors", "feasibility.json"
+_ERRORS, _BOUNDS, _INVERSE_MODEL = "errors.safetensors", "bounds.json", "inverse_model.safetensors"
 _DIVERGENCES, _READING, _READERS = "divergences.safetensors", "reading.json", "readers.safetensors"
 
 Arrays = dict[str, NDArray[Any]]
@@ -195,6 +196,39 @@ class Reproducibility:
         """Return that of several sets of demonstrations, one after the other."""
         one_step, horizon = (np.concatenate([getattr(p, name) for p in parts]) for name in ("one_step", "horizon"))
         return cls(one_step, horizon, sum(part.env_steps for part in parts))
+
+
+@dataclass(frozen=True)
+class Following:
+    """How far a simulator stays behind the demonstrations that it follows, and by which errors that is judged."""
+
+    errors: NDArray[np.float64]
+    """(N,) of the run's demonstrations."""
+    lowest: float
+    """Up to this error a demonstration scores 1."""
+    highest: float
+    """From this error on it scores 0."""
+    model: Arrays = field(default_factory=dict)
+    """Parameters of the model that chose the actions, by name; empty where none was learned."""
+
+    def scores(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (N,) scores of errors, which fall linearly from 1 at the lowest bound to 0 at the highest."""
+        highest = max(self.highest, np.nextafter(self.lowest, np.inf))
+        return np.interp(errors, (self.lowest, highest), (1.0, 0.0))
+
+    def files(self) -> Files:
+        """Return the artifact's content."""
+        return {
+            _ERRORS: encode_arrays({"errors": self.errors}),
+            _BOUNDS: encode_json({"lowest": self.lowest, "highest": self.highest}),
+            _INVERSE_MODEL: encode_arrays(self.model),
+        }
+
+    @classmethod
+    def load(cls, artifact: Artifact) -> Self:
+        """Read an artifact."""
+        values: dict[str, Any] = artifact.arrays(_ERRORS) | artifact.json(_BOUNDS)
+        return cls(**values, model=artifact.arrays(_INVERSE_MODEL))
 
 
 @dataclass(frozen=True)

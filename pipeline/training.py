@@ -190,12 +190,15 @@ def experience(
 ) -> TransitionBatch:
     """Collect at least ``num_steps`` steps of every simulator under one policy, starting with new episodes.
 
-    They begin at ``starts`` (P, S), if there are any; see `Unit`.
+    They begin at ``starts`` (P, S), if there are any; see `Unit`. Raises JobStoppedError when the context asks for a
+    stop; there is no checkpoint, since it is a matter of seconds.
     """
     position = _Position(0, 0, policy, [None] * config.num_groups, History(), starts)
     seed = torch_seed(derive_key(root_seed, "experience"))
     rollouts = []
     while position.iteration * config.steps_per_rollout < num_steps:
+        if context.should_stop():
+            raise JobStoppedError(f"stopped after {position.iteration} rollouts of each group")
         context.rollouts.submit([position.unit(g, seed, environment, config) for g in range(config.num_groups)])
         results = context.rollouts.gather()
         rollouts += [result.rollout for result in results]

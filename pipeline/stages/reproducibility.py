@@ -1,6 +1,7 @@
 """Beside the method: how closely the imitator's simulator can follow each demonstration, without learning.
 
-No other stage reads it, so a run that has it computes the same as one without.
+Nothing of the method reads it, so a run that has it computes the same as one without. The weighting of a competing
+method is made of it: what an inverse model that errs in nothing would say.
 """
 
 from collections.abc import Sequence
@@ -40,7 +41,7 @@ class ReproducibilityStage(Stage):
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the imitator's environment and what the trials depend on."""
-        return _section(config).model_dump() | {"environment": config.environment.model_dump()}
+        return section_of(config).model_dump() | {"environment": config.environment.model_dump()}
 
     def jobs(self, run: Run) -> list[str]:
         """Return one job for every few demonstrations, named by the first and the last."""
@@ -52,7 +53,7 @@ class ReproducibilityStage(Stage):
         first, last = map(int, job.split("-to-"))
         config, chosen = run.config, range(first, last + 1)
         demonstrations = load_demonstrations(run)
-        return follow(demonstrations, chosen, config.environment, _section(config), config.seed, context).files()
+        return follow(demonstrations, chosen, config.environment, section_of(config), config.seed, context).files()
 
     def combine(self, run: Run) -> Files:
         """Join the jobs."""
@@ -70,32 +71,34 @@ def follow(
     environment: EnvironmentConfig,
     section: ReproducibilityConfig,
     seed: int,
-    context: JobContext,
+    context: JobContext | None = None,
+    measure: Demonstrations | None = None,
 ) -> Reproducibility:
-    """Return how closely an environment can follow the chosen demonstrations, measured against all of them.
+    """Return how closely an environment can follow the chosen demonstrations.
 
-    The trials of a demonstration depend on the ``seed`` and on its number.
+    Distances are in deviations of what all of them change by, or those of ``measure`` instead. The trials of a
+    demonstration depend on the ``seed`` and on its number.
     """
     spec = environment_spec(environment.id, environment.dynamics)
     simulators = make_batch(environment.id, environment.dynamics, SIMULATORS)
     follower = Follower(simulators, spec, section.iterations)
-    units = lru_cache(lambda steps: deviations(demonstrations, steps))
+    units = lru_cache(lambda steps: deviations(measure or demonstrations, steps))
     found = []
     for done, n in enumerate(chosen):
-        if context.should_stop():
+        if context is not None and context.should_stop():
             raise JobStoppedError(f"stopped after {done} demonstrations")
         rng = numpy_rng(derive_key(seed, "reproducibility", n))
         states = demonstrations[n].astype(np.float64)
         found.append(follower.residuals(states, section.transitions, section.horizon, units, rng))
-        context.progress(done + 1, len(chosen))
+        if context is not None:
+            context.progress(done + 1, len(chosen))
     one_step, horizon = np.stack(found, axis=1)
     return Reproducibility(one_step, horizon, follower.env_steps)
 
 
-def _section(config: RunConfig) -> ReproducibilityConfig:
-    if config.reproducibility is None:
-        raise ConfigError("reproducibility: the configuration has no such section")
-    return config.reproducibility
+def section_of(config: RunConfig) -> ReproducibilityConfig:
+    """Return the section, or its defaults for a run that has the check only because a weighting reads it."""
+    return config.reproducibility or ReproducibilityConfig()
 
 
 register(ReproducibilityStage())

@@ -144,6 +144,24 @@ def test_an_observed_heading_is_its_own_observation(heading: float) -> None:
     np.testing.assert_allclose(np.exp(1j * seen[0, 4]), np.exp(1j * heading), atol=1e-13)
 
 
+@given(st.floats(1, 59), st.floats(1, 49), st.floats(-1.5, 4.7), st.floats(-1, 1), st.sampled_from(sorted(SOURCES)))
+def test_a_placed_car_is_seen_there_and_goes_on_as_the_recorded_one(
+    x: float, y: float, heading: float, steering: float, name: str
+) -> None:
+    cars, action = make_batch(ID, SOURCES[name], 2), np.full((2, 1), steering)
+    speed = SOURCES[name]["speed"]
+    seen = observe(np.array(x), np.array(y), np.array(heading), speed).astype(np.float32)
+    cars.place(0, seen)
+    np.testing.assert_allclose(cars.observations()[0], seen, atol=1e-6 * max(1, speed))
+    cars.step(action)
+    recorded = cars.observations()[0]
+    cars.place(1, seen)
+    cars.step(action)
+    assert cars.observations()[1].tobytes() == recorded.tobytes()
+    turned = heading + speed * 0.1 * np.sin(np.arctan(0.5 * np.tan(steering)))
+    np.testing.assert_allclose(np.exp(1j * recorded[4]), np.exp(1j * turned), atol=1e-5)
+
+
 @pytest.mark.parametrize("name", SOURCES)
 def test_no_demonstrator_drives_near_the_jump(name: str) -> None:
     cars = make_batch(ID, SOURCES[name], 60)
