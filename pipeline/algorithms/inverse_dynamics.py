@@ -4,12 +4,11 @@ Cao and Sadigh, *Learning from Imperfect Demonstrations from Agents with Varying
 Differs from the released code: states and changes are standardized over the exploration, actions are learned as the
 environment takes them, within their range, and no noise is added to those that follow.
 
-Letters: M transitions, N demonstrations, G simulators, B batch, S observation, A action.
+Letters: M transitions, N demonstrations, G rows, B batch, S observation, A action.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -22,9 +21,6 @@ from oodil.pipeline.algorithms.standardization import standardization
 from oodil.pipeline.config import InverseDynamicsConfig
 from oodil.pipeline.data import Demonstrations, Episode, TransitionBatch
 from oodil.pipeline.seeding import Key, derive_key, numpy_rng, torch_seed
-
-if TYPE_CHECKING:
-    from oodil.pipeline.environments import Simulators
 
 Floats = NDArray[np.float64]
 Bounds = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -150,36 +146,6 @@ class InverseModel(nn.Module):
     def load_moments(self, arrays: dict[str, NDArray[np.float32]]) -> None:
         """Continue from `moments`."""
         self._adam.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
-
-
-class Follower:
-    """Simulators that follow demonstrations by the actions of an inverse model."""
-
-    def __init__(self, simulators: "Simulators", bounds: Bounds, model: InverseModel) -> None:
-        """Take over simulators, in which any number of demonstrations takes turns."""
-        self._simulators, self._bounds, self._model = simulators, bounds, model
-
-    def errors(self, demonstrations: Demonstrations) -> Floats:
-        """Return (N,) summed distances to the states of each demonstration, divided by their number.
-
-        A simulator begins at the first state, and goes on from where it really gets.
-        """
-        size, lengths = self._simulators.num_simulators, demonstrations.lengths
-        found = np.zeros(len(demonstrations))
-        for first in range(0, len(demonstrations), size):
-            rows = np.minimum(np.arange(first, first + size), len(demonstrations) - 1)  # The last one fills the turn.
-            for g, n in enumerate(rows.tolist()):
-                self._simulators.place(g, demonstrations[n][0])
-            here, missed = self._simulators.observations(), np.zeros(size)
-            for t in range(1, lengths[rows].max()):
-                # Where a demonstration is over, its last state is wanted, and nothing is counted.
-                at = demonstrations.offsets[rows] + np.minimum(t, lengths[rows] - 1)
-                wanted = demonstrations.observations[at].astype(np.float64)
-                self._simulators.step(np.clip(self._model.act(here, wanted), *self._bounds))
-                here = self._simulators.observations()
-                missed += np.where(t < lengths[rows], np.linalg.norm(here - wanted, axis=1), 0.0)
-            found[rows] = missed / lengths[rows]
-        return found
 
 
 def error_bounds(errors: Floats, held_out: Floats) -> tuple[float, float]:

@@ -19,6 +19,7 @@ from oodil.pipeline.config import RunConfig, TrainingConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import EnvironmentSpec, environment_spec, make_batch, unplaceable
 from oodil.pipeline.errors import ConfigError, DataError
+from oodil.pipeline.following import ModelFollower
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.results import Following, Policy, Reproducibility, Transferability
 from oodil.pipeline.seeding import derive_key, torch_seed
@@ -28,7 +29,7 @@ from oodil.pipeline.stages.reproducibility import ReproducibilityStage, follow, 
 from oodil.pipeline.stages.weighting import Weighting
 
 if TYPE_CHECKING:
-    from oodil.pipeline.algorithms.inverse_dynamics import Exploration, Follower, InverseModel
+    from oodil.pipeline.algorithms.inverse_dynamics import Exploration, InverseModel
 
 SIMULATORS = 32
 """Demonstrations that are followed side by side. No result depends on it."""
@@ -238,13 +239,11 @@ def _untrained(config: RunConfig, spec: EnvironmentSpec) -> GaussianPolicy:
     return PolicyNetwork(spec.observation_dim, spec.action_dim, _exploration(config).policy_hidden, rng).export()
 
 
-def _follower(config: RunConfig, model: "InverseModel") -> "Follower":
+def _follower(config: RunConfig, model: "InverseModel") -> ModelFollower:
     """Return simulators of the imitator's environment, whose actions a model chooses."""
-    from oodil.pipeline.algorithms.inverse_dynamics import Follower
-
     environment = config.environment
     bounds = _bounds(environment_spec(environment.id, environment.dynamics))
-    return Follower(make_batch(environment.id, environment.dynamics, SIMULATORS), bounds, model)
+    return ModelFollower(make_batch(environment.id, environment.dynamics, SIMULATORS), bounds, model)
 
 
 def _bounds(spec: EnvironmentSpec) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

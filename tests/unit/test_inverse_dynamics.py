@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from oodil.pipeline.algorithms.inverse_dynamics import Exploration, Follower, InverseModel, error_bounds
+from oodil.pipeline.algorithms.inverse_dynamics import Exploration, InverseModel, error_bounds
 from oodil.pipeline.artifacts import write_artifact
 from oodil.pipeline.config import InverseDynamicsConfig
 from oodil.pipeline.data import Demonstrations, Episode, TransitionBatch
 from oodil.pipeline.environments import make_batch
 from oodil.pipeline.errors import ConfigError
+from oodil.pipeline.following import ModelFollower
 from oodil.pipeline.loading import parse_config
 from oodil.pipeline.results import Following
 from oodil.pipeline.stages.inverse_dynamics import judged
@@ -83,7 +84,7 @@ def test_errors_are_summed_distances_over_the_number_of_states() -> None:
     """Placed at (1, 0), the action (1, 0), which 2 is clipped to, leads to (1.4, -0.1) and then to (1.76, -0.19)."""
     demonstrations = shown([[1, 0], [1.4, 0.2], [1.76, -0.19]], [[0, 0], [0.5, -0.1]])
     for simulators in (1, 2, 5):
-        follower = Follower(make_batch(PUSHED, {}, simulators), BOUNDS, Constant(2.0, 0.0))  # type: ignore[arg-type]
+        follower = ModelFollower(make_batch(PUSHED, {}, simulators), BOUNDS, Constant(2.0, 0.0))  # type: ignore[arg-type]
         np.testing.assert_allclose(follower.errors(demonstrations), [0.3 / 3, 0.0], atol=1e-7)
 
 
@@ -136,7 +137,9 @@ def test_a_linear_system_is_inverted_and_followed() -> None:
     for _ in range(30):
         states.append(0.9 * states[-1] + MIXING @ rng.uniform(-1, 1, 2))
     far = [[0.0, 0.0], *([3.0, 3.0] for _ in range(30))]
-    near, lost = Follower(make_batch(PUSHED, {}, 2), BOUNDS, model).errors(shown([s.tolist() for s in states], far))
+    near, lost = ModelFollower(make_batch(PUSHED, {}, 2), BOUNDS, model).errors(
+        shown([s.tolist() for s in states], far)
+    )
     assert near < 0.05 < 0.5 < lost
 
 
@@ -164,7 +167,7 @@ def test_the_number_of_simulators_changes_no_bit(assert_same_bits: Any) -> None:
         states.append(simulators.observations())
     demonstrations = Demonstrations.of([Episode(each[: 10 + 5 * g]) for g, each in enumerate(np.stack(states, 1))], "")
     bounds = np.full(3, -1, np.float32), np.full(3, 1, np.float32)
-    one, *others = (Follower(make_batch(HOPPER, {}, g), bounds, model).errors(demonstrations) for g in (1, 3, 20))
+    one, *others = (ModelFollower(make_batch(HOPPER, {}, g), bounds, model).errors(demonstrations) for g in (1, 3, 20))
     assert (one > 0).all()
     for other in others:
         assert_same_bits(other, one)
@@ -217,6 +220,6 @@ def test_environments_that_cannot_be_placed_are_refused_before_any_work(baseline
 
 
 def test_exact_id_needs_a_state_that_is_observed() -> None:
-    with pytest.raises(ConfigError, match="what is observed of environment .* does not tell its state"):
+    with pytest.raises(ConfigError, match=r"what is observed of environment .* does not tell its state"):
         parse_config(values(environment={"id": "oodil/Panda20Hz-v0"}, baselines=["exact_id"]), "test")
     parse_config(values(environment={"id": "oodil/Panda20Hz-v0"}, baselines=["id_random"]), "test")
