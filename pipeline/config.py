@@ -114,6 +114,8 @@ class TrainingConfig(_Section):
     normalize_observations: bool = True
     """Standardize what policy and value see, by the weighted demonstrations' statistics (for experts, by running
     ones)."""
+    scale_rewards: bool = False
+    """Multiply rewards by 1 - discount, so that values are of order one."""
     anneal: bool = True
     """Let the steps of the policy and of the discriminator shrink linearly to zero, so that the end is settled."""
     initial_log_std: float = 0.0

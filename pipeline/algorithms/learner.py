@@ -89,6 +89,7 @@ class Learner(Generic[Reward]):
         self.config = config
         self.reward_model = reward_model
         self.root_seed = root_seed
+        self._reward_scale = 1 - config.discount if config.scale_rewards else 1.0
         rng = torch.Generator().manual_seed(torch_seed(derive_key(root_seed, "learner", "initial")))
         self.policy = PolicyNetwork(observation_dim, action_dim, config.policy_hidden, rng)
         with torch.no_grad():
@@ -124,7 +125,7 @@ class Learner(Generic[Reward]):
         # Scaled by 1 - discount, values are averages of rewards, and so of order one for every horizon.
         rewards = self.reward_model.rewards(batch)
         metrics = {"reward": float(rewards.mean()), "policy_lag": float(iteration - batch.policy_version)}
-        rewards *= np.float32(1 - config.discount)
+        rewards *= np.float32(self._reward_scale)
         for_ever = self.reward_model.goes_on(batch.next_observations[batch.terminated])
         rewards[batch.terminated] *= np.where(for_ever, np.float32(1 / (1 - config.discount)), np.float32(1))
         observations = torch.from_numpy(batch.observations).flatten(0, 1)

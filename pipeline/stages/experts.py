@@ -44,6 +44,7 @@ EXPERT_TRAINING = TrainingConfig(
     discount=0.995,
     gae_lambda=0.97,
     normalize_observations=True,
+    scale_rewards=True,
     policy_optimizer=PpoConfig(learning_rate=1e-3, epochs=5, minibatch_size=512),
     value=ValueConfig(learning_rate=1e-3, epochs=5, minibatch_size=512),
 )

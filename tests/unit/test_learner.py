@@ -84,6 +84,7 @@ def test_interrupted_equals_uninterrupted(shown, assert_same_bits, policy_optimi
         "demonstrations": shown if imitate else None,
         "policy_optimizer": policy_optimizer,
         "normalize_observations": normalize,
+        "scale_rewards": normalize,
         "initial_log_std": -0.5,
     }
     whole = build(**settings)
@@ -289,13 +290,13 @@ class TestEnds:
         assert ends.include(asked[:0]).shape == (0,)
 
     def test_the_last_reward_goes_on_for_ever(self, demonstrations, rollout, monkeypatch):
-        """With discount 1/2 a reward r is worth r / 2 each step, and r for ever."""
+        """With discount 1/2 a reward r for ever is worth 2 r."""
         config = GailConfig(total_steps=100, discount=0.5)
         reward = AdversarialReward(demonstrations(21, 11), np.ones(2), DiscriminatorConfig(), 20, 0)
         learner, batch = Learner(3, 2, config, reward, 0), TransitionBatch.of([rollout(0)])
         batch.terminated[[1, 2], [0, 1]] = True
         monkeypatch.setattr(reward, "goes_on", lambda states: (states == batch.next_observations[2, 1]).all(1))
-        expected = 0.5 * reward.rewards(batch)
+        expected = reward.rewards(batch)
         expected[2, 1] *= 2
         seen = []
 
