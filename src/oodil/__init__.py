@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from oodil.api import evaluate, open_run, run
+    from oodil.api import evaluate, open_run, run, score
     from oodil.orchestrator import Observer
     from oodil.pipeline.config import RunConfig
     from oodil.pipeline.data import Demonstrations
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         Transferability,
     )
     from oodil.pipeline.runs import RunResults
+    from oodil.pipeline.scoring import Scored
     from oodil.pipeline.stage import register
     from oodil.pipeline.stages import PolicyStage, Weighting
 
@@ -49,6 +50,7 @@ __all__ = [
     "Reproducibility",
     "RunConfig",
     "RunResults",
+    "Scored",
     "Transferability",
     "UnfinishedError",
     "Weighting",
@@ -58,12 +60,13 @@ __all__ = [
     "read_demonstrations",
     "register",
     "run",
+    "score",
     "shipped_configs",
     "write_report",
 ]
 
 _HOMES = {
-    "oodil.api": ("evaluate", "open_run", "run"),
+    "oodil.api": ("evaluate", "open_run", "run", "score"),
     "oodil.orchestrator": ("Observer",),
     "oodil.pipeline.config": ("RunConfig",),
     "oodil.pipeline.data": ("Demonstrations",),
@@ -81,6 +84,7 @@ _HOMES = {
         "Transferability",
     ),
     "oodil.pipeline.runs": ("RunResults",),
+    "oodil.pipeline.scoring": ("Scored",),
     "oodil.pipeline.stage": ("register",),
     "oodil.pipeline.stages": ("PolicyStage", "Weighting"),
 }

@@ -7,15 +7,20 @@ from typing import Any
 from oodil.orchestrator import Observer, check_inputs, choose, execute, read_run
 from oodil.orchestrator import open_run as open_folder
 from oodil.pipeline.config import RunConfig
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.datasets.foreign import read_any
+from oodil.pipeline.errors import DataError
 from oodil.pipeline.evaluation import evaluate as evaluate_policy
 from oodil.pipeline.loading import load_config
 from oodil.pipeline.results import Evaluation, Policy
 from oodil.pipeline.runs import RunResults
+from oodil.pipeline.scoring import Scored, check_dimension
+from oodil.pipeline.scoring import score as score_by
 from oodil.pipeline.seeding import derive_key
 from oodil.workers.engine import Engine
 from oodil.workers.local_engine import LocalEngine
 
-__all__ = ["evaluate", "open_run", "run"]
+__all__ = ["evaluate", "open_run", "run", "score"]
 
 
 def run(
@@ -73,6 +78,41 @@ def open_run(path: str | Path) -> RunResults:
         {'demonstration': 0, 'cluster': 2, 'transferability': 0.41, 'weight': 0.049}
     """
     return RunResults(read_run(Path(path)))
+
+
+def score(
+    run: str | Path | RunResults, demonstrations: Demonstrations | str | Path, weighting: str | None = None
+) -> Scored:
+    """Return what a finished run says of demonstrations that come later; nothing is trained.
+
+    Args:
+        run: a run, or its folder.
+        demonstrations: what to score, or what `oodil score` takes: a file, or ``minari:DATASET_ID``.
+        weighting: one weighting alone; default: every one of the run that can.
+
+    Raises OodilError for what the caller can mend: states of another dimension or environment, a stage that is not
+    finished, a weighting that cannot score what was not part of its run.
+
+    Example:
+        >>> scored = oodil.score("runs/quickstart-seed0", "later.safetensors")  # doctest: +SKIP
+        >>> scored.found["transferability"].verdicts  # doctest: +SKIP
+        array(['kept', 'unlike'], dtype='<U8')
+    """
+    results = run if isinstance(run, RunResults) else open_run(run)
+    if not isinstance(demonstrations, Demonstrations):
+        demonstrations = read_later(results, str(demonstrations))
+    return score_by(results, demonstrations, weighting)
+
+
+def read_later(
+    results: RunResults, source: str, keys: tuple[str, ...] = (), ends_are_failures: bool = False
+) -> Demonstrations:
+    """Return demonstrations that a run is to score. Raises DataError that names the source, and what does not fit."""
+    demonstrations, environment = read_any(source, keys, ends_are_failures)
+    check_dimension(results, demonstrations, source)
+    if environment and environment != results.config.environment.id:
+        raise DataError(f"{source}: recorded in {environment}, but the run is for {results.config.environment.id}")
+    return demonstrations
 
 
 def evaluate(
