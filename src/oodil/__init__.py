@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from oodil.api import evaluate, open_run, run, score
+    from oodil.api import evaluate, finetune, open_run, run, score
     from oodil.orchestrator import Observer
     from oodil.pipeline.config import RunConfig
     from oodil.pipeline.data import Demonstrations
@@ -55,6 +55,7 @@ __all__ = [
     "UnfinishedError",
     "Weighting",
     "evaluate",
+    "finetune",
     "load_config",
     "open_run",
     "read_demonstrations",
@@ -66,7 +67,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "oodil.api": ("evaluate", "open_run", "run", "score"),
+    "oodil.api": ("evaluate", "finetune", "open_run", "run", "score"),
     "oodil.orchestrator": ("Observer",),
     "oodil.pipeline.config": ("RunConfig",),
     "oodil.pipeline.data": ("Demonstrations",),

@@ -265,6 +265,27 @@ def score(
 
 
 @app.command()
+def finetune(
+    run_dir: RunPath,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Later demonstrations, a file of ours.")],
+    overrides: Overrides = None,
+    weighting: Annotated[str | None, typer.Option(metavar="NAME", help="Scores them; default: ours.")] = None,
+    workers: Workers = None,
+    folder: Annotated[
+        Path | None, typer.Option("--run-dir", help="Of the fine-tuning; default: RUN_DIR-finetuned-FILE-NAME.")
+    ] = None,
+) -> None:
+    """Go on training a finished run's policy with later demonstrations; it is a run of its own."""
+    from oodil.api import finetuning
+    from oodil.api import open_run as open_results
+    from oodil.orchestrator import choose, open_run
+
+    config, default = finetuning(open_results(run_dir), file, overrides or (), weighting)
+    where = _engine(config, "local", workers)
+    _execute(open_run(folder or default, config), choose(config), where, None)
+
+
+@app.command()
 def bench(
     config_source: ConfigSource,
     overrides: Overrides = None,
