@@ -393,6 +393,22 @@ class ImitationConfig(_Section):
     is kept. They run side by side where there are no more workers than trainings."""
 
 
+class FinetuningConfig(_Section):
+    """How `oodil finetune` goes on from the policy of a finished run, on its demonstrations and later ones. What is not
+    here is as in `imitation`."""
+
+    run: Path | None = None
+    """Folder of the run that is continued, set by the command. A run with it has the stages of a fine-tuning alone, and
+    `demonstrations.file` holds the later demonstrations."""
+    weighting: str = "transferability"
+    """Weighting of that run by which the later demonstrations are scored."""
+    total_steps: PositiveInt | None = None
+    """Environment steps of each training; null for a quarter of `imitation.gail.total_steps`."""
+    initial_std: PositiveFloat = 0.3
+    """What the policy's standard deviation is set to at the beginning; it shrinks again to `imitation.gail.final_std`,
+    which it must not be below."""
+
+
 class EvaluationConfig(_Section):
     """What is measured beside the training. Nothing here changes a policy or a score, so nothing is part of a
     fingerprint: a finished training keeps the measurements that it was made with."""
@@ -485,6 +501,8 @@ class RunConfig(_Section):
     """The competing method ID, for runs that have `id_random` or `id_gail` among their baselines."""
     imitation: ImitationConfig
     """The final policy."""
+    finetuning: FinetuningConfig = FinetuningConfig()
+    """A continuation of a finished run."""
     baselines: tuple[str, ...] = ()
     """Policies that are trained beside it for comparison: `naive_gail`, `oracle`, `f_mdp`, `f_mdp_per_source`,
     `id_random`, `id_gail`, `exact_id`, or `module:name` for one that another module registers."""

@@ -22,6 +22,7 @@ _DEMONSTRATIONS, _SOURCES = "demonstrations.safetensors", "demonstrations.json"
 _ASSIGNMENT, _DIAGNOSTICS, _ENCODER = "assignment.safetensors", "diagnostics.json", "encoder.safetensors"
 _SCORES, _HISTORY, _SUMMARY = "transferability.safetensors", "history.safetensors", "summary.json"
 _POLICY, _POLICY_META, _DISCRIMINATOR = "policy.safetensors", "policy.json", "discriminator.safetensors"
+_VALUE = "value.safetensors"
 _CURVE, _EVALUATION = "curve.json", "evaluation.json"
 _IMITATORS, _JOB_SCORES, _TRAININGS = "imitators.json", "scores.safetensors", "trainings.json"
 _RESIDUALS, _DISTANCE = "residuals.safetensors", "distance.json"
@@ -598,6 +599,16 @@ class Policy:
             action_high=_bounds(described["action_high"], np.inf),
             env_steps=described["env_steps"],
         )
+
+
+def value_file(arrays: Arrays) -> Files:
+    """Return the file of a policy's value function, with which its training can be continued."""
+    return {_VALUE: encode_arrays(arrays)}
+
+
+def load_value(artifact: Artifact) -> Arrays:
+    """Return a value function's parameters by name."""
+    return artifact.arrays(_VALUE)
 
 
 def discriminator_file(arrays: Arrays) -> Files:

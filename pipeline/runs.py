@@ -146,8 +146,12 @@ class RunResults:
     def score(self, demonstrations: Demonstrations, weighting: str = "transferability") -> Transferability:
         """Return what a finished weighting says of other demonstrations; nothing is trained.
 
-        Raises CannotScoreError for a weighting that cannot, and DataError when the states have another dimension.
+        Raises CannotScoreError for a weighting that cannot, ConfigError for one that the run does not have, and
+        DataError when the states have another dimension.
         """
+        known = [each.name for each in self.weightings]
+        if weighting not in known:
+            raise ConfigError(f"{self.path}: no weighting {weighting!r}; this run has {', '.join(known)}")
         self.artifact(weighting)
         stage = next(each for each in self.weightings if each.name == weighting)
         return stage.score(self.run, demonstrations)

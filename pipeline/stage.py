@@ -51,6 +51,17 @@ class Run:
         return _finished(read_artifact(self.directory.job(stage, job)), f"{stage}/{job}")
 
 
+def base_run(config: RunConfig) -> Run | None:
+    """Return the run that a fine-tuning continues; None for any other run. Raises ConfigError if it cannot be read."""
+    if config.finetuning.run is None:
+        return None
+    directory = RunDirectory(config.finetuning.run)
+    try:
+        return Run(RunConfig.model_validate_json(directory.config.read_bytes()), directory)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"finetuning.run: {directory.path} is not a run that can be continued ({error})") from error
+
+
 def _finished(artifact: Artifact | None, name: str) -> Artifact:
     if artifact is None:
         raise NotFinishedError(f"{name} is not finished")

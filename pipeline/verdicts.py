@@ -30,8 +30,10 @@ class Verdicts:
     demonstrations: int
     kept: int
     open: int
+    unlike: int
+    """Those without a score, which nothing below speaks of but the shares."""
     score: float
-    """Mean of their scores."""
+    """Mean of their scores; NaN if none has any."""
     low: float
     """Mean of the lower ends of their intervals."""
     high: float
@@ -44,7 +46,7 @@ class Verdicts:
     @property
     def not_kept(self) -> int:
         """How many are not kept."""
-        return self.demonstrations - self.kept - self.open
+        return self.demonstrations - self.kept - self.open - self.unlike
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class VerdictTable:
         ]
         known = np.unique(found.clusters[found.clusters >= 0]).tolist()
         clusters = [_verdicts(str(k), found.clusters == k, found, masses) for k in known]
-        best_first = tuple(sorted(clusters, key=lambda each: -each.score))
+        best_first = tuple(sorted(clusters, key=lambda each: -np.nan_to_num(each.score)))
         return cls(tuple(sources), best_first, found.threshold, effective_number(found.weights))
 
     @property
@@ -100,15 +102,19 @@ def _verdicts(
     found: Transferability,
     masses: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> Verdicts:
-    verdicts = found.verdicts[chosen]
-    low, high = found.intervals[chosen].mean(axis=0).tolist()
+    verdicts, scored = found.verdicts[chosen], chosen & np.isfinite(found.scores)
+    score, low, high = float("nan"), float("nan"), float("nan")
+    if scored.any():
+        score = float(found.scores[scored].mean())
+        low, high = found.intervals[scored].mean(axis=0).tolist()
     before, after = (float(mass[chosen].sum()) for mass in masses)
     return Verdicts(
         name=name,
         demonstrations=int(chosen.sum()),
         kept=int((verdicts == "kept").sum()),
         open=int((verdicts == "open").sum()),
-        score=float(found.scores[chosen].mean()),
+        unlike=int((verdicts == "unlike").sum()),
+        score=score,
         low=low,
         high=high,
         share_before=before,

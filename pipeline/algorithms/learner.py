@@ -106,6 +106,15 @@ class Learner(Generic[Reward]):
         """Return a copy of the current policy for rollout workers."""
         return self.policy.export()
 
+    def value_arrays(self) -> dict[str, NDArray[np.float32]]:
+        """Return a copy of the value function's parameters by name."""
+        return {name: value.numpy().copy() for name, value in self.value.state_dict().items()}
+
+    def continue_from(self, policy: GaussianPolicy, value: dict[str, NDArray[np.float32]]) -> None:
+        """Begin with a trained policy, but for its noise, and with the value function that was trained with it."""
+        self.policy.load_mean(policy)
+        self.value.load_state_dict({name: torch.from_numpy(each) for name, each in value.items()})
+
     def update(self, batch: TransitionBatch, iteration: int) -> dict[str, float]:
         """Learn from one iteration's batch.
 

@@ -150,6 +150,16 @@ class PolicyNetwork(nn.Module):
         """Return the entropy of the Gaussian in nats, which does not depend on the observation."""
         return self.log_std.sum() + 0.5 * (1 + float(np.log(2 * np.pi))) * len(self.log_std)
 
+    @torch.no_grad()
+    def load_mean(self, policy: GaussianPolicy) -> None:
+        """Take over everything of an exported policy but its noise. The networks must have the same widths."""
+        for layer, weight, bias in zip(self.net.layers, policy.weights, policy.biases, strict=True):
+            layer.weight.copy_(torch.from_numpy(weight.T))
+            layer.bias.copy_(torch.from_numpy(bias))
+        self.input_mean.copy_(torch.from_numpy(policy.input_mean))
+        self.input_scale.copy_(torch.from_numpy(policy.input_scale))
+        self.input_limit.fill_(policy.input_limit)
+
     def export(self) -> GaussianPolicy:
         """Return a copy for rollout workers."""
         layers = self.net.layers

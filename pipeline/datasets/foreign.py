@@ -1,14 +1,26 @@
-"""Demonstrations from elsewhere, whatever their format, for ``oodil demos convert``."""
+"""Demonstrations from elsewhere, whatever their format, for ``oodil demos convert`` and ``oodil score``."""
 
 from dataclasses import replace
 from pathlib import Path
 
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.datasets import minari, npz, official, robomimic
+from oodil.pipeline.datasets.native import read_demonstrations
 from oodil.pipeline.errors import DataError
 
 _MINARI = "minari:"
 FORMATS = "FILE.npz, FILE.hdf5 (robomimic), FILE.pkl (released code) or minari:DATASET_ID"
+
+
+def read_any(source: str, keys: tuple[str, ...] = (), ends_are_failures: bool = False) -> tuple[Demonstrations, str]:
+    """Return the demonstrations of a file of ours, or of one of `FORMATS`, and the imitator's environment they name.
+
+    Only our own files name it: others name the one that they were recorded in, under a name of their own.
+    """
+    if Path(source).suffix == ".safetensors":
+        return read_demonstrations(source)
+    label = source if source.startswith(_MINARI) else Path(source).stem
+    return read_foreign(source, label, keys, ends_are_failures)[0], ""
 
 
 def read_foreign(source: str, label: str, keys: tuple[str, ...], ends_are_failures: bool) -> tuple[Demonstrations, str]:

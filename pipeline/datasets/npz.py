@@ -1,11 +1,15 @@
 """NumPy archives: our own two arrays, one array per demonstration, or the trajectories of the `imitation` library."""
 
+import io
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
+from numpy.typing import NDArray
 
-from oodil.pipeline.data import Episode
+from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.errors import DataError
 
 
@@ -38,3 +42,12 @@ def _imitation(archive: np.lib.npyio.NpzFile) -> list[Episode]:
     returns = [float(r.sum()) for r in np.split(archive["rews"], cuts)] if "rews" in archive else [np.nan] * len(states)
     ended = archive["terminal"] if "terminal" in archive else np.zeros(len(states), np.bool_)
     return [Episode(s, r, bool(e)) for s, r, e in zip(states, returns, ended, strict=True)]
+
+
+def encode(demonstrations: Demonstrations, columns: Mapping[str, NDArray[Any]]) -> bytes:
+    """Return an archive of ``observations`` and ``offsets``, with an array ``oodil_*`` for each (N,) column."""
+    content = io.BytesIO()
+    found = {f"oodil_{name}": column for name, column in columns.items()}
+    arrays: dict[str, Any] = {"observations": demonstrations.observations, "offsets": demonstrations.offsets} | found
+    np.savez(content, **arrays)
+    return content.getvalue()

@@ -1,5 +1,6 @@
 """HDF5 files as robomimic writes them: ``data/demo_N/obs/KEY``. Needs the extra ``oodil[data]``."""
 
+import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -49,20 +50,44 @@ def write_masks(path: Path, demonstrations: Demonstrations, columns: Mapping[str
     import h5py
 
     with h5py.File(path, "r+") as file:
-        names = np.array(_names(file))
-        if len(names) != len(demonstrations):
-            raise DataError(f"{path}: has {len(names)} demonstrations; the run has {len(demonstrations)}")
-        transferable = columns["weight"] > columns["weight"].mean()
-        masks = {"oodil_transferable": transferable}
-        masks |= {f"oodil_cluster_{k}": columns["cluster"] == k for k in np.unique(columns["cluster"])}
-        for mask, members in masks.items():
-            if f"mask/{mask}" in file:
-                del file[f"mask/{mask}"]
-            file[f"mask/{mask}"] = np.array(names[members], "S")
-        for n, name in enumerate(names):
-            for column, values in columns.items():
-                file[f"data/{name}"].attrs[f"oodil_{column}"] = values[n].item()
-        return int(transferable.sum())
+        count = len(_names(file))
+        if count != len(demonstrations):
+            raise DataError(f"{path}: has {count} demonstrations; the run has {len(demonstrations)}")
+        return _mark(file, columns)
+
+
+def encode(demonstrations: Demonstrations, environment: str, columns: Mapping[str, NDArray[Any]]) -> bytes:
+    """Return a new file with the demonstrations, their states as the one entry ``state``, and what `write_masks` adds.
+
+    ``next_obs`` is there so that no state is lost.
+    """
+    import h5py
+
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        file.create_group("data").attrs["env_args"] = json.dumps({"env_name": environment})
+        for n in range(len(demonstrations)):
+            group, states = file.create_group(f"data/demo_{n}"), demonstrations[n]
+            group["obs/state"], group["next_obs/state"] = states[:-1], states[1:]
+            group.attrs["num_samples"] = len(states) - 1
+        _mark(file, columns)
+    return content.getvalue()
+
+
+def _mark(file: Any, columns: Mapping[str, NDArray[Any]]) -> int:
+    """Add masks and attributes to the demonstrations of an open file; return how many are called transferable."""
+    names = np.array(_names(file))
+    transferable = columns["weight"] > columns["weight"].mean()
+    masks = {"oodil_transferable": transferable}
+    masks |= {f"oodil_cluster_{k}": columns["cluster"] == k for k in np.unique(columns["cluster"])}
+    for mask, members in masks.items():
+        if f"mask/{mask}" in file:
+            del file[f"mask/{mask}"]
+        file[f"mask/{mask}"] = np.array(names[members], "S")
+    for n, name in enumerate(names):
+        for column, values in columns.items():
+            file[f"data/{name}"].attrs[f"oodil_{column}"] = values[n].item()
+    return int(transferable.sum())
 
 
 def _names(file: Any) -> list[str]:

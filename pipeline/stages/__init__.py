@@ -14,6 +14,7 @@ from oodil.pipeline.stages import (
     demonstrations,
     experts,
     feasibility,
+    finetuning,
     imitators,
     inverse_dynamics,
     marks,
@@ -31,6 +32,7 @@ __all__ = [
     "demonstrations",
     "experts",
     "feasibility",
+    "finetuning",
     "imitators",
     "inverse_dynamics",
     "marks",
@@ -53,6 +55,9 @@ def stages(config: RunConfig) -> list[Stage]:
             add(needed)
         found.setdefault(name, stage)
 
+    if config.finetuning.run is not None:
+        add("finetuning")
+        return list(found.values())
     if config.reproducibility is not None:
         add("reproducibility")  # It takes a minute, so it comes before everything that takes longer.
     for entry in ("imitation", *config.baselines):
@@ -62,7 +67,7 @@ def stages(config: RunConfig) -> list[Stage]:
                 importlib.import_module(module)
             except ModuleNotFoundError as error:
                 raise ConfigError(f"baselines: {entry!r} cannot be loaded: {error}") from error
-        known = [stage.name for stage in registered() if isinstance(stage, PolicyStage)]
+        known = [stage.name for stage in registered() if isinstance(stage, PolicyStage) and stage.name != "finetuning"]
         if name not in known:
             raise ConfigError(f"baselines: no policy {name!r}; there are {', '.join(known)}")
         add(name)

@@ -14,7 +14,7 @@ from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.policy import Controller, GaussianPolicy
 from oodil.pipeline.results import CollectedDemonstrations
 from oodil.pipeline.seeding import derive_key, numpy_rng
-from oodil.pipeline.stage import JobContext, Run, Stage, register
+from oodil.pipeline.stage import JobContext, Run, Stage, base_run, register
 from oodil.pipeline.stages.experts import load_expert, transfer_returns
 
 COLLECTION_SIMULATORS = 16
@@ -36,7 +36,9 @@ class DemonstrationsStage(Stage):
         section = config.demonstrations
         common = {"environment": config.environment.id}
         if section.file is not None:
-            return common | {"file_sha256": hashlib.sha256(read_file(section.file)).hexdigest()}
+            base = base_run(config)
+            before = {} if base is None else {"base": base.artifact(self.name).sha256}
+            return common | before | {"file_sha256": hashlib.sha256(read_file(section.file)).hexdigest()}
         sources = [
             {"dynamics": source.dynamics, "count": source.count, "expert_sha256": _identity(source)}
             for source in section.sources
@@ -53,11 +55,14 @@ class DemonstrationsStage(Stage):
         return [f"source-{i}" for i in range(len(run.config.demonstrations.sources))] or [self.name]
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
-        """Collect from one source, or take over the file."""
+        """Collect from one source, or take over the file, after the demonstrations of the run that is continued."""
         config = run.config
         section = config.demonstrations
         if section.file is not None:
             demonstrations, _ = read_demonstrations(section.file)
+            base = base_run(config)
+            if base is not None:
+                demonstrations = Demonstrations.joined([load_demonstrations(base), demonstrations])
             return CollectedDemonstrations(demonstrations, (), config.environment.id).files()
         index = self.jobs(run).index(job)
         source = section.sources[index]

@@ -1,19 +1,23 @@
 """Stage 5: a policy, by GAIL on weighted demonstrations (Eqn 7 and 8); policies differ in their weightings alone."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodil.pipeline.artifacts import Files
-from oodil.pipeline.config import RunConfig
+from oodil.pipeline.config import GailConfig, RunConfig
 from oodil.pipeline.environments import environment_spec
 from oodil.pipeline.evaluation import distance_of, evaluate
-from oodil.pipeline.results import LearningCurve, Policy, Training, Trainings, discriminator_file
+from oodil.pipeline.results import LearningCurve, Policy, Training, Trainings, discriminator_file, value_file
 from oodil.pipeline.seeding import derive_key, torch_seed
 from oodil.pipeline.stage import JobContext, Run, Stage, register, stage_named
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 from oodil.pipeline.stages.weighting import Weighting
+
+if TYPE_CHECKING:
+    from oodil.pipeline.algorithms.gail import AdversarialReward
+    from oodil.pipeline.algorithms.learner import Learner
 
 
 class PolicyStage(Stage):
@@ -22,7 +26,7 @@ class PolicyStage(Stage):
     A competing method is an instance with a weighting of its own, registered beside it.
     """
 
-    version = 3
+    version = 4
     distributed = True
 
     def __init__(self, name: str, title: str, weighting: str | None) -> None:
@@ -49,8 +53,16 @@ class PolicyStage(Stage):
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return what a training depends on."""
-        gail = config.imitation.gail.model_dump(mode="json")
+        gail = self.gail(config).model_dump(mode="json")
         return {"gail": gail, "environment": config.environment.model_dump()}
+
+    def gail(self, config: RunConfig) -> GailConfig:
+        """Return how each training is done."""
+        return config.imitation.gail
+
+    def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> bool:
+        """Bring a new learner to where its training begins; return whether it acts as somebody has trained it to."""
+        return False
 
     def jobs(self, run: Run) -> list[str]:
         """Return the trainings."""
@@ -74,7 +86,7 @@ class PolicyStage(Stage):
         from oodil.pipeline.training import Probe, train
 
         config, evaluation = run.config, run.config.evaluation
-        environment, gail = config.environment, config.imitation.gail
+        environment, gail = config.environment, self.gail(config)
         spec = environment_spec(environment.id, environment.dynamics)
         # The same seeds for all policies: they differ in their weights alone.
         seed = torch_seed(derive_key(config.seed, "imitation", job))
@@ -88,6 +100,7 @@ class PolicyStage(Stage):
             seen = evaluate(policy, environment.id, environment.dynamics, evaluation.episodes, key)
             return np.array([seen.mean_return, seen.std_return, seen.mean_length])
 
+        known = [curve_point()] if self.begin(run, learner) and evaluation.num_points else []
         probe = Probe("curve", evaluation.num_points, curve_point)
         history = train(learner, environment, gail, [probe], context, self.checkpoints(run, job))
         policy = Policy(
@@ -98,14 +111,16 @@ class PolicyStage(Stage):
             action_high=spec.action_high,
             env_steps=gail.num_iterations * gail.steps_per_iteration,
         )
-        mean, std, length = history.values("curve").reshape(-1, 3).T
-        curve = LearningCurve(history.steps("curve"), mean, std, length, evaluation.episodes)
+        mean, std, length = np.concatenate([*known, history.values("curve").ravel()]).reshape(-1, 3).T
+        steps = np.concatenate([np.zeros(len(known), np.int64), history.steps("curve")])
+        curve = LearningCurve(steps, mean, std, length, evaluation.episodes)
         key = derive_key(config.seed, "final")
         final = evaluate(policy.gaussian, environment.id, environment.dynamics, evaluation.final_episodes, key)
         distance = distance_of(policy.gaussian, learner.reward_model, environment, seed)
         training = Training(job, policy.env_steps, distance, final.mean_return)
         discriminator = discriminator_file(learner.reward_model.discriminator_arrays())
-        return policy.files() | discriminator | curve.files() | final.files() | Trainings((training,)).files()
+        value = value_file(learner.value_arrays())
+        return policy.files() | value | discriminator | curve.files() | final.files() | Trainings((training,)).files()
 
     def combine(self, run: Run) -> Files:
         """Keep the training whose policy comes closest to the weighted demonstrations; returns play no part."""

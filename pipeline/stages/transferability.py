@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oodil.pipeline.algorithms.weights import intervals, kept_weights, share_lasted, transferability_of_divergences
 from oodil.pipeline.artifacts import Files
@@ -58,6 +59,10 @@ class TransferabilityStage(Weighting):
         if share == 0:
             return super().rule(config)
         return f"{super().rule(config)}, if the whole interval reaches {share:.0%} of the best cluster's score"
+
+    def weights(self, found: Transferability) -> NDArray[np.float64]:
+        """Return (N,) weights of scores and intervals, of those that are kept."""
+        return kept_weights(found.scores, found.intervals, found.threshold)
 
     def jobs(self, run: Run) -> list[str]:
         """Return one job per imitator, under its name."""

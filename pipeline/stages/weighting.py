@@ -2,6 +2,10 @@
 
 from abc import abstractmethod
 
+import numpy as np
+from numpy.typing import NDArray
+
+from oodil.pipeline.algorithms.weights import kept_weights
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.errors import OodilError
@@ -26,6 +30,11 @@ class Weighting(Stage):
     def rule(self, config: RunConfig) -> str:
         """Say, for the report, how a demonstration's weight follows from its score."""
         return "a demonstration is drawn for imitation in proportion to its score"
+
+    def weights(self, found: Transferability) -> NDArray[np.float64]:
+        """Return (N,) weights by `rule`, of scores and intervals that were found of demonstrations in several parts."""
+        everything = np.zeros((len(found.scores), 2))
+        return kept_weights(found.scores, everything, threshold=0.0)
 
     @abstractmethod
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:

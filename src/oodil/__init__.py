@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from oodil.api import evaluate, open_run, run
+    from oodil.api import evaluate, finetune, open_run, run, score
     from oodil.orchestrator import Observer
     from oodil.pipeline.config import RunConfig
     from oodil.pipeline.data import Demonstrations
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         Transferability,
     )
     from oodil.pipeline.runs import RunResults
+    from oodil.pipeline.scoring import Scored
     from oodil.pipeline.stage import register
     from oodil.pipeline.stages import PolicyStage, Weighting
 
@@ -49,21 +50,24 @@ __all__ = [
     "Reproducibility",
     "RunConfig",
     "RunResults",
+    "Scored",
     "Transferability",
     "UnfinishedError",
     "Weighting",
     "evaluate",
+    "finetune",
     "load_config",
     "open_run",
     "read_demonstrations",
     "register",
     "run",
+    "score",
     "shipped_configs",
     "write_report",
 ]
 
 _HOMES = {
-    "oodil.api": ("evaluate", "open_run", "run"),
+    "oodil.api": ("evaluate", "finetune", "open_run", "run", "score"),
     "oodil.orchestrator": ("Observer",),
     "oodil.pipeline.config": ("RunConfig",),
     "oodil.pipeline.data": ("Demonstrations",),
@@ -81,6 +85,7 @@ _HOMES = {
         "Transferability",
     ),
     "oodil.pipeline.runs": ("RunResults",),
+    "oodil.pipeline.scoring": ("Scored",),
     "oodil.pipeline.stage": ("register",),
     "oodil.pipeline.stages": ("PolicyStage", "Weighting"),
 }

@@ -4,18 +4,25 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from oodil.orchestrator import Observer, check_inputs, choose, execute, read_run
 from oodil.orchestrator import open_run as open_folder
 from oodil.pipeline.config import RunConfig
+from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.datasets.foreign import read_any
+from oodil.pipeline.errors import DataError
 from oodil.pipeline.evaluation import evaluate as evaluate_policy
 from oodil.pipeline.loading import load_config
 from oodil.pipeline.results import Evaluation, Policy
 from oodil.pipeline.runs import RunResults
+from oodil.pipeline.scoring import Scored, check_dimension
+from oodil.pipeline.scoring import score as score_by
 from oodil.pipeline.seeding import derive_key
 from oodil.workers.engine import Engine
 from oodil.workers.local_engine import LocalEngine
 
-__all__ = ["evaluate", "open_run", "run"]
+__all__ = ["evaluate", "finetune", "open_run", "run", "score"]
 
 
 def run(
@@ -73,6 +80,99 @@ def open_run(path: str | Path) -> RunResults:
         {'demonstration': 0, 'cluster': 2, 'transferability': 0.41, 'weight': 0.049}
     """
     return RunResults(read_run(Path(path)))
+
+
+def score(
+    run: str | Path | RunResults, demonstrations: Demonstrations | str | Path, weighting: str | None = None
+) -> Scored:
+    """Return what a finished run says of demonstrations that come later; nothing is trained.
+
+    Args:
+        run: a run, or its folder.
+        demonstrations: what to score, or what `oodil score` takes: a file, or ``minari:DATASET_ID``.
+        weighting: one weighting alone; default: every one of the run that can.
+
+    Raises OodilError for what the caller can mend: states of another dimension or environment, a stage that is not
+    finished, a weighting that cannot score what was not part of its run.
+
+    Example:
+        >>> scored = oodil.score("runs/quickstart-seed0", "later.safetensors")  # doctest: +SKIP
+        >>> scored.found["transferability"].verdicts  # doctest: +SKIP
+        array(['kept', 'unlike'], dtype='<U8')
+    """
+    results = run if isinstance(run, RunResults) else open_run(run)
+    if not isinstance(demonstrations, Demonstrations):
+        demonstrations = read_later(results, str(demonstrations))
+    return score_by(results, demonstrations, weighting)
+
+
+def finetune(
+    run: str | Path | RunResults,
+    file: str | Path,
+    overrides: Sequence[str] = (),
+    *,
+    weighting: str | None = None,
+    workers: int | None = None,
+    run_dir: str | Path | None = None,
+    observer: Observer | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> RunResults:
+    """Go on training a finished run's policy, on its demonstrations and later ones; interrupted, it goes on.
+
+    It is a run of its own, with the old demonstrations before the new ones.
+
+    Args:
+        run: the finished run, or its folder.
+        file: the later demonstrations, in a file of ours.
+        overrides: ``key.sub=value`` each, such as ``finetuning.total_steps=500000``.
+        weighting: of the run, by which the later demonstrations are scored; default: ours.
+        workers, observer, should_stop: as for `oodil.run`.
+        run_dir: the new run's folder; default: beside the old one, named after it, the file and the weighting.
+
+    Raises OodilError for what the caller can mend, `UnfinishedError` when a job failed or a stop was asked for.
+
+    Example:
+        >>> tuned = oodil.finetune("runs/quickstart-seed0", "later.safetensors")  # doctest: +SKIP
+        >>> tuned.curve("finetuning").mean_return  # doctest: +SKIP
+    """
+    config, folder = finetuning(run if isinstance(run, RunResults) else open_run(run), Path(file), overrides, weighting)
+    where = LocalEngine(config.runtime.workers if workers is None else workers)
+    opened = open_folder(folder if run_dir is None else Path(run_dir), config)
+    execute(opened, choose(config), where, observer, should_stop)
+    return RunResults(opened)
+
+
+def finetuning(
+    results: RunResults, file: Path, overrides: Sequence[str] = (), weighting: str | None = None
+) -> tuple[RunConfig, Path]:
+    """Return the configuration of a fine-tuning and its default folder. Raises OodilError if there can be none."""
+    name = weighting or results.weightings[0].name
+    results.artifact(results.policies[0].name)
+    if file.suffix != ".safetensors":
+        raise DataError(f"{file}: is no file of ours (.safetensors); `oodil demos convert` makes one")
+    later = read_later(results, str(file))
+    results.score(later.select(np.array([0])), name)  # One tells whether the weighting can score any.
+    values = results.config.model_dump(mode="json") | {
+        "name": f"{results.config.name}-finetuned",
+        "demonstrations": {"file": str(file.absolute())},
+        "baselines": [],
+        "reproducibility": None,
+    }
+    values["finetuning"] |= {"run": str(results.path.absolute()), "weighting": name}
+    config = load_config(values, overrides)
+    path = results.path.absolute()
+    return config, path.with_name(f"{path.name}-finetuned-{file.stem}-{name}")
+
+
+def read_later(
+    results: RunResults, source: str, keys: tuple[str, ...] = (), ends_are_failures: bool = False
+) -> Demonstrations:
+    """Return demonstrations that a run is to score. Raises DataError that names the source, and what does not fit."""
+    demonstrations, environment = read_any(source, keys, ends_are_failures)
+    check_dimension(results, demonstrations, source)
+    if environment and environment != results.config.environment.id:
+        raise DataError(f"{source}: recorded in {environment}, but the run is for {results.config.environment.id}")
+    return demonstrations
 
 
 def evaluate(

@@ -67,6 +67,12 @@ Force = Annotated[
 Bind = Annotated[str | None, typer.Option(help="Let workers of other machines join here, e.g. tcp://0.0.0.0:5555.")]
 Keys = Annotated[Path | None, typer.Option(help="Folder of keys, made by `oodil keys new`; --bind needs it.")]
 EngineName = Annotated[Literal["local", "ray"], typer.Option(help="This machine's processes, or a Ray cluster.")]
+StateKeys = Annotated[
+    str, typer.Option("--keys", help="For observations with several entries: those of a state, joined by commas.")
+]
+EndsAreFailures = Annotated[
+    bool, typer.Option(help="Episodes that the environment ended are ones in which the demonstrator failed.")
+]
 TrustCluster = Annotated[bool, typer.Option("--trust-cluster", help="Use a Ray cluster that asks for no token.")]
 
 
@@ -229,6 +235,57 @@ def evaluate(
 
 
 @app.command()
+def score(
+    run_dir: RunPath,
+    source: Annotated[
+        str,
+        typer.Argument(metavar="FILE", help="FILE.safetensors, or whatever `oodil demos convert` reads."),
+    ],
+    weighting: Annotated[str | None, typer.Option(metavar="NAME", help="One weighting; default: all that can.")] = None,
+    output: Annotated[
+        Path | None, typer.Option(help="A table FILE.csv, or the demonstrations with scores in FILE.hdf5 or FILE.npz.")
+    ] = None,
+    keys: StateKeys = "",
+    ends_are_failures: EndsAreFailures = False,
+) -> None:
+    """Score demonstrations that come later by a finished run; nothing is trained."""
+    from oodil.api import open_run, read_later
+    from oodil.pipeline.datasets.export import check_new_file, write_new
+    from oodil.pipeline.scoring import score as score_by
+    from oodil.terminal import print_scores
+
+    if output is not None:
+        check_new_file(output, source)
+    results = open_run(run_dir)
+    scored = score_by(results, read_later(results, source, _state_keys(keys), ends_are_failures), weighting)
+    print_scores(results, scored)
+    if output is not None:
+        write_new(scored.demonstrations, results.config.environment.id, scored.columns(), output)
+        print(f"{output}: {len(scored.demonstrations)} demonstrations")
+
+
+@app.command()
+def finetune(
+    run_dir: RunPath,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Later demonstrations, a file of ours.")],
+    overrides: Overrides = None,
+    weighting: Annotated[str | None, typer.Option(metavar="NAME", help="Scores them; default: ours.")] = None,
+    workers: Workers = None,
+    folder: Annotated[
+        Path | None, typer.Option("--run-dir", help="Of the fine-tuning; default: RUN_DIR-finetuned-FILE-NAME.")
+    ] = None,
+) -> None:
+    """Go on training a finished run's policy with later demonstrations; it is a run of its own."""
+    from oodil.api import finetuning
+    from oodil.api import open_run as open_results
+    from oodil.orchestrator import choose, open_run
+
+    config, default = finetuning(open_results(run_dir), file, overrides or (), weighting)
+    where = _engine(config, "local", workers)
+    _execute(open_run(folder or default, config), choose(config), where, None)
+
+
+@app.command()
 def bench(
     config_source: ConfigSource,
     overrides: Overrides = None,
@@ -308,12 +365,8 @@ def convert_demos(
     ],
     environment: Annotated[str, typer.Option(help="Id of the imitator's environment, such as oodil/Hopper-v0.")],
     output: Annotated[Path, typer.Option(help="The file to write.")] = Path("demonstrations.safetensors"),
-    keys: Annotated[
-        str, typer.Option(help="For observations with several entries: those that make up a state, joined by commas.")
-    ] = "",
-    ends_are_failures: Annotated[
-        bool, typer.Option(help="Episodes that the environment ended are ones in which the demonstrator failed.")
-    ] = False,
+    keys: StateKeys = "",
+    ends_are_failures: EndsAreFailures = False,
 ) -> None:
     """Make one file of demonstrations from files in other formats; each becomes a source, named by its file."""
     from oodil.pipeline.artifacts import write_file
@@ -324,8 +377,7 @@ def convert_demos(
     parts = []
     for source in sources:
         label = source if source.startswith("minari:") else Path(source).stem
-        chosen = tuple(key for key in keys.split(",") if key)
-        part, recorded = read_foreign(source, label, chosen, ends_are_failures)
+        part, recorded = read_foreign(source, label, _state_keys(keys), ends_are_failures)
         print(f"{source}: {len(part)} demonstrations" + (f" from {recorded}" if recorded else ""))
         parts.append(part)
     write_file(output, encode_demonstrations(Demonstrations.joined(parts), environment))
@@ -343,6 +395,10 @@ def export_demos(
 
     results = open_run(run_dir)
     print(export(results.demonstrations, results.transferability.columns(), target))
+
+
+def _state_keys(keys: str) -> tuple[str, ...]:
+    return tuple(key for key in keys.split(",") if key)
 
 
 def _engine(

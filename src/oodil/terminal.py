@@ -23,11 +23,15 @@ from oodil.workers.reports import Progress as JobProgress
 
 if TYPE_CHECKING:
     from oodil.pipeline.data import Demonstrations
+    from oodil.pipeline.results import Transferability
+    from oodil.pipeline.scoring import Scored
 
 PLAIN_INTERVAL_S = 10.0
 """Seconds between lines about one job where there is no terminal."""
 SHOWN_METRICS = ("return", "length", "loss", "value_loss")
 """Figures of a job that are shown beside its bar."""
+MOST_ROWS = 50
+"""Demonstrations in a table; a file takes the others."""
 
 
 @contextmanager
@@ -225,15 +229,49 @@ def _print_verdicts(console: Console, results: RunResults) -> None:
 def _verdict_table(found: VerdictTable) -> Table:
     table = Table(box=None, padding=(0, 1), pad_edge=False)
     table.add_column("source", max_width=20, overflow="ellipsis", no_wrap=True)
-    for name in ("n", "kept", "open", "score and interval", "drawn"):
+    unlike = any(row.unlike for row in found.by_source)
+    for name in ("n", "kept", "open", *(["unlike"] if unlike else []), "score and interval", "drawn"):
         table.add_column(name, justify="right", no_wrap=True)
     for title, rows in (("", found.by_source), ("[bold]cluster[/]", found.by_cluster)):
         if title:
             table.add_row(title)
         for row in rows:
-            counts = (str(each) for each in (row.demonstrations, row.kept, row.open))
-            score = f"{row.score:.3f} [{row.low:.3f}, {row.high:.3f}]"
-            table.add_row(escape(row.name), *counts, escape(score), f"{row.share_before:.1%} -> {row.share:.1%}")
+            counts = (str(each) for each in (row.demonstrations, row.kept, row.open, *([row.unlike] if unlike else [])))
+            score = escape(_score(row.score, row.low, row.high))
+            table.add_row(escape(row.name), *counts, score, f"{row.share_before:.1%} -> {row.share:.1%}")
+    return table
+
+
+def _score(score: float, low: float, high: float) -> str:
+    """Return a score with its interval; a dash where there is none."""
+    return f"{score:.3f} [{low:.3f}, {high:.3f}]" if np.isfinite(score) else "-"
+
+
+def print_scores(results: RunResults, scored: "Scored") -> None:
+    """Print what each weighting says of demonstrations that came later, by source and one by one."""
+    console, titles = Console(), {each.name: each.title for each in results.weightings}
+    for name, found in scored.found.items():
+        console.print(f"\n{escape(titles[name])}: kept from a score of {found.threshold:.3f}", highlight=False)
+        console.print(_verdict_table(VerdictTable.of(found, scored.demonstrations)))
+        console.print(_demonstration_table(found, scored.demonstrations))
+        if len(scored.demonstrations) > MOST_ROWS:
+            console.print(f"... and {len(scored.demonstrations) - MOST_ROWS} more; --output FILE.csv has all")
+    for name, reason in scored.refused.items():
+        console.print(f"{escape(titles[name])}: {escape(reason)}", highlight=False, soft_wrap=True)
+
+
+def _demonstration_table(found: "Transferability", demonstrations: "Demonstrations") -> Table:
+    table = Table(box=None, padding=(0, 1), pad_edge=False)
+    table.add_column("demonstration", justify="right")
+    table.add_column("source", max_width=20, overflow="ellipsis", no_wrap=True)
+    for name in ("cluster", "score and interval", "verdict"):
+        table.add_column(name, justify="right", no_wrap=True)
+    verdicts = found.verdicts
+    for n in range(min(len(demonstrations), MOST_ROWS)):
+        source = escape(demonstrations.source_labels[demonstrations.sources[n]])
+        cluster = str(found.clusters[n]) if found.clusters[n] >= 0 else ""
+        score = escape(_score(float(found.scores[n]), *found.intervals[n]))
+        table.add_row(str(n), source, cluster, score, str(verdicts[n]))
     return table
 
 
