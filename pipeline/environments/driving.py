@@ -106,6 +106,11 @@ def observe(x: Floats, y: Floats, heading: Floats, speed: float) -> Floats:
     )
 
 
+def positions(observations: NDArray[np.floating]) -> Floats:
+    """Return (P, 2) x and y in metres of (P, S) observations."""
+    return np.asarray((observations[:, :2].astype(np.float64) / 2 + 0.5) * (WIDTH, HEIGHT))
+
+
 def touches(x: Floats, y: Floats, heading: Floats, box: Box) -> NDArray[np.bool_]:
     """Return (G,) whether each car and the box overlap: they do unless one of four axes lies between them."""
     dx, dy = np.abs(x - box.x), np.abs(y - box.y)

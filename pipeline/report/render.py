@@ -3,6 +3,7 @@
 Letters: N demonstrations, K clusters.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
@@ -12,7 +13,7 @@ import yaml
 from markupsafe import Markup
 
 from oodil.pipeline.algorithms.weights import effective_number
-from oodil.pipeline.report import figures, formats, looks, score_figures, summary
+from oodil.pipeline.report import figures, formats, looks, paths, score_figures, summary
 from oodil.pipeline.report.policies import PolicySection, read_policies
 from oodil.pipeline.report.sources import Source, Sources
 from oodil.pipeline.report.summary import Card, Findings, Note
@@ -68,6 +69,14 @@ class Mixture:
     rows: tuple[SourceRow, ...]
     reproducibility: str
     """Which sources the imitator's simulator can follow; empty where it was not tried."""
+
+
+@dataclass(frozen=True)
+class PathsSection:
+    """Where a weighting sees weight in the plane."""
+
+    title: str
+    figure: Markup
 
 
 @dataclass(frozen=True)
@@ -131,6 +140,8 @@ class Report:
     policies: PolicySection | None
     weightings: tuple[WeightingSection, ...]
     mixture: Mixture | None
+    paths: tuple[PathsSection, ...]
+    """For an environment whose demonstrations are paths in a plane."""
     clusters: ClusterSection | None
     trainings: tuple[TrainingSection, ...]
     stages: tuple[StageRow, ...]
@@ -160,6 +171,7 @@ def context(results: RunResults) -> Report:
         policies=read_policies(found),
         weightings=tuple(_weighting(found, sources, name) for name in found.ranking) if sources else (),
         mixture=_mixture(found, sources) if sources and found.weightings else None,
+        paths=tuple(_paths(found, sources)) if sources else (),
         clusters=(
             _clusters(found, sources, assignment, found.diagnostics)
             if sources and assignment and found.diagnostics
@@ -254,6 +266,14 @@ def _mixture(found: Findings, sources: Sources) -> Mixture:
         columns=tuple(columns),
         rows=tuple(map(SourceRow, sources.each, zip(*values, strict=True))),
     )
+
+
+def _paths(found: Findings, sources: Sources) -> Iterator[PathsSection]:
+    world = paths.world_of(found.results.config.environment)
+    if world is not None:
+        for name, weighting in found.weightings.items():
+            drawn = paths.paths(sources.demonstrations, weighting.weights, sources.looks, world)
+            yield PathsSection(found.title(name), drawn)
 
 
 def reproducible(sources: dict[str, bool]) -> str:

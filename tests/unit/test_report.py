@@ -14,9 +14,10 @@ from oodil.pipeline import stage as stage_module
 from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations, Episode
+from oodil.pipeline.environments.driving import layout
 from oodil.pipeline.errors import StorageError
 from oodil.pipeline.metrics import Metrics
-from oodil.pipeline.report import Report, context, summary, write_report
+from oodil.pipeline.report import Report, context, paths, summary, write_report
 from oodil.pipeline.report.looks import MUTED, POLICIES, contrast, source_looks
 from oodil.pipeline.report.sources import Source, Sources, ranks_demonstrations
 from oodil.pipeline.report.summary import Findings
@@ -557,3 +558,31 @@ def test_stage_times_are_those_of_the_last_computation(tmp_path: Path) -> None:
     ]
     run.directory.events.write_text("\n".join(map(json.dumps, lines)))
     assert RunResults(run).seconds() == {"clustering": 50.0, "transferability": 300.5, "imitation": 70.0}
+
+
+DRIVING: dict[str, Any] = {"id": "oodil/Driving-v0", "dynamics": {"obstacle_1": 0.3, "obstacle_2": 0.2, "speed": 1.0}}
+
+
+def test_paths_are_drawn_in_the_plane_for_every_weighting(tmp_path: Path, full: tuple[Run, Page]) -> None:
+    run = new_run(tmp_path, SMALL["marks"], SMALL["counts"], ("oracle",), environment=DRIVING)
+    writer = Writer(run, SMALL["num_clusters"])
+    for name in ("demonstrations", "clustering", "imitators", "transferability", "marks"):
+        writer.steps()[name]()
+    report = contents(run)
+    assert [section.title for section in report.paths] == ["ours", "marks"]
+    assert "The paths by weight" in render(run).text
+    assert paths.world_of(run.config.environment) == layout(0.3, 0.2, 1.0)
+    ours, marks = (str(section.figure) for section in report.paths)
+    assert "● 3 paths" in ours and "● 5 paths" in ours and ours != marks
+    assert not contents(full[0]).paths
+
+
+def test_a_picture_of_paths_follows_the_weights_and_nothing_else() -> None:
+    """Equal weights give equal bytes; the shades go from light to dark."""
+    world = layout(0.3, 0.2, 1.0)
+    across = [Episode(np.array([[-1.0, y, 0, 0, 0], [1.0, -y, 0, 0, 0]])) for y in (-0.5, 0.5)]
+    held = Demonstrations.of(across, "a")
+    looks = source_looks([None])
+    first, second = (paths.paths(held, np.array(weights), looks, world) for weights in ([0.9, 0.1], [0.1, 0.9]))
+    assert first == paths.paths(held, np.array([0.9, 0.1]), looks, world) and first != second
+    assert paths.SHADES(0.0)[:3] > paths.SHADES(0.5)[:3] > paths.SHADES(1.0)[:3]
