@@ -504,12 +504,18 @@ class RunConfig(_Section):
     finetuning: FinetuningConfig = FinetuningConfig()
     """A continuation of a finished run."""
     baselines: tuple[str, ...] = ()
-    """Policies that are trained beside it for comparison: `naive_gail`, `oracle`, `f_mdp`, `f_mdp_per_source`,
-    `id_random`, `id_gail`, `exact_id`, or `module:name` for one that another module registers."""
+    """Policies that are trained beside it for comparison: `naive_gail`, `naive_gail_all_steps`, `oracle`, `f_mdp`,
+    `f_mdp_per_source`, `id_random`, `id_gail`, `exact_id`, or `module:name` for one that another module registers."""
     evaluation: EvaluationConfig = EvaluationConfig()
     """What is measured beside the training."""
     runtime: RuntimeConfig = RuntimeConfig()
     """How it runs."""
+
+    @property
+    def cluster_steps(self) -> int:
+        """Environment steps of the imitators of all clusters together."""
+        section = self.transferability
+        return self.clustering.num_clusters * section.num_trainings * section.gail.total_steps
 
     @model_validator(mode="before")
     @classmethod

@@ -46,7 +46,12 @@ class FeasibilityWeighting(Weighting):
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the section, how policies learn, the steps of all together, and the environment."""
         section, environment = config.f_mdp.model_dump(), config.environment.model_dump()
-        return {"f_mdp": section, "learning": _learning(config), "steps": _budget(config), "environment": environment}
+        return {
+            "f_mdp": section,
+            "learning": _learning(config),
+            "steps": config.cluster_steps,
+            "environment": environment,
+        }
 
     def jobs(self, run: Run) -> list[str]:
         """Return the one policy."""
@@ -138,7 +143,7 @@ def training_config(config: RunConfig, tracked: Demonstrations, num_policies: in
     return TrainingConfig.model_validate(
         _learning(config)
         | {
-            "total_steps": -(-_budget(config) // num_policies),
+            "total_steps": -(-config.cluster_steps // num_policies),
             "num_groups": 1,
             "simulators_per_group": -(-config.f_mdp.steps_per_iteration // longest),
             "steps_per_rollout": longest,
@@ -152,12 +157,6 @@ def _learning(config: RunConfig) -> dict[str, Any]:
     collected = {"total_steps", "num_groups", "simulators_per_group", "steps_per_rollout", "lag"}
     gail = config.transferability.gail
     return gail.model_dump(mode="json", include=set(TrainingConfig.model_fields) - collected)
-
-
-def _budget(config: RunConfig) -> int:
-    """Return the environment steps of the imitators of all clusters together."""
-    section = config.transferability
-    return config.clustering.num_clusters * section.num_trainings * section.gail.total_steps
 
 
 def _scale(config: RunConfig, demonstrations: Demonstrations) -> NDArray[np.floating]:

@@ -131,8 +131,18 @@ class PolicyStage(Stage):
         return artifacts[kept.job].files() | Trainings(ordered).files()
 
 
+class AllStepsPolicy(PolicyStage):
+    """A policy with as many environment steps as our method takes in all, the imitators of its clusters included."""
+
+    def gail(self, config: RunConfig) -> GailConfig:
+        """Return the training of our policy, with its share of the clusters' steps."""
+        gail, share = config.imitation.gail, -(-config.cluster_steps // config.imitation.num_trainings)
+        return gail.model_copy(update={"total_steps": gail.total_steps + share})
+
+
 register(PolicyStage("imitation", title="ours", weighting="transferability"))
 register(PolicyStage("naive_gail", title="naive GAIL", weighting=None))
+register(AllStepsPolicy("naive_gail_all_steps", title="naive GAIL, our steps in all", weighting=None))
 register(PolicyStage("oracle", title="oracle", weighting="marks"))
 register(PolicyStage("id_random", title="ID without GAIL", weighting="inverse_dynamics_random"))
 register(PolicyStage("id_gail", title="ID with GAIL", weighting="inverse_dynamics_gail"))

@@ -23,6 +23,8 @@ from oodil.pipeline.config import (
 )
 from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.loading import load_config, parse_config
+from oodil.pipeline.stage import stage_named
+from oodil.pipeline.stages import PolicyStage
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = sorted((ROOT / "configs").glob("*.yaml"))
@@ -286,3 +288,12 @@ def test_discriminators_that_score_keep_learning_unless_told_otherwise() -> None
     assert not TransferabilityConfig.model_validate(section).gail.anneal
     assert TransferabilityConfig.model_validate({"gail": {"total_steps": 10, "anneal": True}}).gail.anneal
     assert ImitationConfig.model_validate(section).gail.anneal
+
+
+def test_naive_gail_can_have_all_the_steps_of_our_method():
+    config = load_config("quickstart", ["imitation.num_trainings=3"])
+    ours = config.cluster_steps + 3 * config.imitation.gail.total_steps
+    stage = stage_named("naive_gail_all_steps")
+    assert isinstance(stage, PolicyStage)
+    assert ours <= 3 * stage.gail(config).total_steps < ours + 3
+    assert config.cluster_steps == config.clustering.num_clusters * config.transferability.gail.total_steps
