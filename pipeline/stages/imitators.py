@@ -75,7 +75,7 @@ class ImitatorsStage(Stage):
     """A job per cluster and training, each with its own checkpoint and artifact; empty clusters have none."""
 
     name = "imitators"
-    version = 2
+    version = 3
     inputs = ("demonstrations", "clustering")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:

@@ -142,8 +142,8 @@ class AllStepsPolicy(PolicyStage):
 
 register(PolicyStage("imitation", title="ours", weighting="transferability"))
 register(PolicyStage("naive_gail", title="naive GAIL", weighting=None))
-register(AllStepsPolicy("naive_gail_all_steps", title="naive GAIL, our steps in all", weighting=None))
 register(PolicyStage("oracle", title="oracle", weighting="marks"))
+register(AllStepsPolicy("naive_gail_all_steps", title="naive GAIL, our steps in all", weighting=None))
 register(PolicyStage("id_random", title="ID without GAIL", weighting="inverse_dynamics_random"))
 register(PolicyStage("id_gail", title="ID with GAIL", weighting="inverse_dynamics_gail"))
 register(PolicyStage("exact_id", title="exact ID", weighting="exact_inverse_dynamics"))
