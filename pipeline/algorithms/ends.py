@@ -4,8 +4,8 @@ Letters: N demonstrations, E ends of episodes, P known states, S observation.
 """
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from oodil.pipeline.algorithms.standardization import standardization
 from oodil.pipeline.data import Demonstrations
@@ -36,14 +36,14 @@ class DemonstratedEnds:
         owners = np.searchsorted(demonstrations.offsets, rows, side="right") - 1
         left = demonstrations.offsets[owners + 1] - 1 - rows
         self._is_last = (steps < max_episode_steps)[owners] & (left <= LAST_PART * steps[owners])
-        self._known = self._standardized(demonstrations.observations[rows])
+        self._known = cKDTree(self._standardized(demonstrations.observations[rows]))
 
     def include(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return (E,) whether demonstrations end around each of (E, S) states."""
         if not len(states) or not self._is_last.any():
             return np.zeros(len(states), np.bool_)
-        nearest = torch.cdist(self._standardized(states), self._known).argmin(dim=1)
-        return np.asarray(self._is_last[nearest.numpy()])
+        _, nearest = self._known.query(self._standardized(states))
+        return np.asarray(self._is_last[nearest])
 
-    def _standardized(self, states: NDArray[np.float32]) -> torch.Tensor:
-        return torch.from_numpy(np.clip((states - self._mean) * self._scale, -LARGEST_INPUT, LARGEST_INPUT))
+    def _standardized(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.clip((states - self._mean) * self._scale, -LARGEST_INPUT, LARGEST_INPUT)

@@ -131,9 +131,9 @@ class Learner(Generic[Reward]):
         config = self.config
         step_scale = 1 - iteration / config.num_iterations if config.anneal else 1.0
         rng = torch.Generator().manual_seed(torch_seed(derive_key(self.root_seed, "learner", iteration)))
-        # Scaled by 1 - discount, values are averages of rewards, and so of order one for every horizon.
         rewards = self.reward_model.rewards(batch)
         metrics = {"reward": float(rewards.mean()), "policy_lag": float(iteration - batch.policy_version)}
+        # Scaled by 1 - discount, values are averages of rewards, and so of order one for every horizon.
         rewards *= np.float32(self._reward_scale)
         for_ever = self.reward_model.goes_on(batch.next_observations[batch.terminated])
         rewards[batch.terminated] *= np.where(for_ever, np.float32(1 / (1 - config.discount)), np.float32(1))
