@@ -17,14 +17,14 @@ from oodil.pipeline.config import RunConfig, TrainingConfig
 from oodil.pipeline.data import Demonstrations, Unit, UnitResult
 from oodil.pipeline.environments import environment_spec, make_batch, why_unplaceable
 from oodil.pipeline.environments.tracking import TrackingSimulators, distances
-from oodil.pipeline.errors import ConfigError, DataError
+from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.results import FeasibilityScale, Tracker, Transferability
 from oodil.pipeline.seeding import derive_key, torch_seed
 from oodil.pipeline.stage import JobContext, Run, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 from oodil.pipeline.stages.policies import PolicyStage
-from oodil.pipeline.stages.weighting import CannotScoreError, Weighting
+from oodil.pipeline.stages.weighting import CannotScoreError, Weighting, refuse_other_states
 
 SIMULATORS = 32
 """Demonstrations that a trained policy tracks side by side."""
@@ -101,12 +101,8 @@ class FeasibilityWeighting(Weighting):
 
         Raises DataError when the states have another dimension than those of the run.
         """
+        refuse_other_states(run, demonstrations)
         known = load_demonstrations(run)
-        if demonstrations.observation_dim != known.observation_dim:
-            raise DataError(
-                f"the states have {demonstrations.observation_dim} dimensions; "
-                f"the policy of {self.name} tracks states with {known.observation_dim}"
-            )
         policy = Tracker.load(run.job_artifact(self.name, "shared")).policy
         found = _distances(run.config, policy, demonstrations, _scale(run.config, known))
         return _weighted(found, FeasibilityScale.load(run.artifact(self.name)), env_steps=0)

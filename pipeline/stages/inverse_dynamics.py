@@ -18,7 +18,7 @@ from oodil.pipeline.artifacts import Checkpoints, Files, below, nested
 from oodil.pipeline.config import RunConfig, TrainingConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import EnvironmentSpec, environment_spec, make_batch, unplaceable
-from oodil.pipeline.errors import ConfigError, DataError
+from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.following import ModelFollower
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.results import Following, Policy, Reproducibility, Transferability
@@ -26,7 +26,7 @@ from oodil.pipeline.seeding import derive_key, torch_seed
 from oodil.pipeline.stage import JobContext, JobStoppedError, Run, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 from oodil.pipeline.stages.reproducibility import ReproducibilityStage, follow, section_of
-from oodil.pipeline.stages.weighting import Weighting
+from oodil.pipeline.stages.weighting import Weighting, refuse_other_states
 
 if TYPE_CHECKING:
     from oodil.pipeline.algorithms.inverse_dynamics import Exploration, InverseModel
@@ -99,7 +99,7 @@ class InverseDynamics(Weighting):
 
         Raises DataError when the states have another dimension than those of the run.
         """
-        _refuse_other_states(run, demonstrations)
+        refuse_other_states(run, demonstrations)
         found, model = Following.load(run.artifact(self.name)), self._model(run.config)
         model.load(found.model)
         errors = _follower(run.config, model).errors(demonstrations)
@@ -200,7 +200,7 @@ class ExactInverseDynamics(Weighting):
 
         Raises DataError when the states have another dimension than those of the run.
         """
-        _refuse_other_states(run, demonstrations)
+        refuse_other_states(run, demonstrations)
         config, known = run.config, load_demonstrations(run)
         chosen, section = range(len(demonstrations)), section_of(config)
         seen = follow(demonstrations, chosen, config.environment, section, config.seed, measure=known)
@@ -249,15 +249,6 @@ def _follower(config: RunConfig, model: "InverseModel") -> ModelFollower:
 def _bounds(spec: EnvironmentSpec) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the (A,) lowest and highest action."""
     return spec.action_low.ravel(), spec.action_high.ravel()
-
-
-def _refuse_other_states(run: Run, demonstrations: Demonstrations) -> None:
-    """Raise DataError for states of another dimension."""
-    known = load_demonstrations(run).observation_dim
-    if demonstrations.observation_dim != known:
-        raise DataError(
-            f"the demonstrations have {demonstrations.observation_dim} dimensions; those of the run {known}"
-        )
 
 
 register(InverseDynamics("inverse_dynamics_random", title="ID without GAIL", explorer=None))

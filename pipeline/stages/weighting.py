@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from oodil.pipeline.algorithms.weights import kept_weights
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.errors import OodilError
+from oodil.pipeline.errors import DataError, OodilError
 from oodil.pipeline.results import Transferability
 from oodil.pipeline.stage import Run, Stage
+from oodil.pipeline.stages.demonstrations import load_demonstrations
 
 
 class Weighting(Stage):
@@ -46,3 +47,10 @@ class Weighting(Stage):
 
 class CannotScoreError(OodilError):
     """A weighting that cannot score demonstrations which were not part of its run."""
+
+
+def refuse_other_states(run: Run, demonstrations: Demonstrations) -> None:
+    """Raise DataError for demonstrations whose states have another dimension than those of the run."""
+    dim, expected = demonstrations.observation_dim, load_demonstrations(run).observation_dim
+    if dim != expected:
+        raise DataError(f"the states have {dim} dimensions; those of the run have {expected}")
