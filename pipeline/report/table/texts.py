@@ -1,0 +1,188 @@
+"""The table as text: Markdown, CSV and LaTeX."""
+
+import csv
+import io
+import re
+from typing import Any
+
+from oodil.pipeline.report import formats
+from oodil.pipeline.report.table.grids import Grid, findings, grids, notes
+from oodil.pipeline.report.table.summary import MEASURES, Entry, Table
+
+COLUMNS = ("mean_return", "std_return", *(name for name in MEASURES if name != "mean_return"))
+"""Figures of a cell in the CSV file."""
+
+
+def mean(table: Table, entry: Entry) -> str:
+    """Return the mean of an entry; a dash where no seed has a figure."""
+    return table.measure.shown(entry.found.mean) if entry.found else formats.UNKNOWN
+
+
+def deviation(table: Table, entry: Entry) -> str:
+    """Return the deviation of an entry, with its sign; nothing for one seed or none."""
+    if entry.found is None or len(entry.by_seed) < 2:
+        return ""
+    return f"± {table.measure.deviation(entry.found.deviation, entry.found.mean)}"
+
+
+def over_seeds(table: Table, entry: Entry) -> str:
+    """Return the interquartile mean and its interval, or with few seeds the values themselves."""
+    if entry.found is None:
+        return formats.UNKNOWN
+    shown = table.measure.shown
+    if entry.found.interval:
+        low, high = entry.found.interval
+        said = f"IQM {shown(entry.found.interquartile_mean)} ({shown(low)} to {shown(high)})"
+    else:
+        said = " · ".join(map(shown, entry.by_seed.values()))
+    fewer = len(entry.by_seed) < len(table.records.seeds)
+    return f"{said}, {len(entry.by_seed)} of {len(table.records.seeds)} seeds" if fewer else said
+
+
+def explained(table: Table) -> str:
+    """Return how the table is to be read."""
+    records = table.records
+    seeds = ", ".join(map(str, records.seeds))
+    said = f"{table.measure.title.capitalize() if table.measure.title != 'AUROC' else 'AUROC'}: mean ± standard "
+    said += f"deviation over seed{'s' * (len(records.seeds) > 1)} {seeds}. "
+    if not records.published:
+        return said + "Marked: the best of each row."
+    source = f" ({records.source})" if records.source else ""
+    return said + f"In parentheses: the published figure{source}. Marked: the better of the two."
+
+
+def how_made(made: dict[str, Any]) -> str:
+    """Return one line on what is known of how the experiment was made; nothing where nothing is."""
+    parts = []
+    for key, value in made.items():
+        name = re.sub(r" per s$", " per second", key.replace("_", " "))
+        if isinstance(value, dict) and "seconds" in key and value and all(_is_number(each) for each in value.values()):
+            total = sum(value.values())
+            each = formats.duration(total / len(value))
+            parts.append(f"{formats.plural(len(value), 'run')} of {each} on average, {formats.duration(total)} in all")
+        elif value not in (None, "", {}, []):
+            parts.append(f"{name}: {_plain(value)}")
+    return "; ".join(parts)
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key.replace('_', ' ')} {_plain(each)}" for key, each in value.items())
+    if isinstance(value, list):
+        return ", ".join(map(_plain, value))
+    return f"{value:,.6g}" if _is_number(value) else str(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def markdown(table: Table, level: int = 1) -> str:
+    """Return the whole of the table's page that is not a figure; its title is a heading of the given level."""
+    records, heading = table.records, "#" * level
+    parts = [f"{heading} {_escaped(records.experiment)}", _escaped(records.caption), main_table(table)]
+    parts.append(_escaped(explained(table)))
+    parts.append("\n".join(f"* {_escaped(line)}" for line in (*findings(table), *notes(table))))
+    parts.append(f"{heading}# Over seeds")
+    head = ("", *records.methods.values())
+    parts.append(_lines(head, [(row, *(over_seeds(table, e) for e in _entries(table, row))) for row in records.rows]))
+    for grid in grids(table):
+        parts += [f"{heading}# {grid.title}", _escaped(grid.caption), grid_table(grid)]
+    made = how_made(records.made)
+    parts.append(f"Made with: {_escaped(made)}." if made else "")
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def main_table(table: Table) -> str:
+    """Return the table itself in Markdown, the marked figures in bold."""
+    records = table.records
+    rows = []
+    for row in records.rows:
+        cells = []
+        for entry in _entries(table, row):
+            mark = table.marked.get((row, entry.method))
+            cell = [_bold(mean(table, entry), mark == "found"), deviation(table, entry)]
+            if entry.published is not None:
+                cell.append(f"({_bold(table.measure.shown(entry.published), mark == 'published')})")
+            cells.append(" ".join(part for part in cell if part))
+        rows.append((_escaped(row), *cells))
+    head = tuple(map(_escaped, ("", *records.methods.values())))
+    return _lines(head, rows, escape=False)
+
+
+def grid_table(grid: Grid) -> str:
+    """Return a grid in Markdown."""
+    return _lines(grid.head, list(grid.rows))
+
+
+def _entries(table: Table, row: str) -> list[Entry]:
+    return [table.entries[row, method] for method in table.records.methods]
+
+
+def _lines(head: tuple[str, ...], rows: list[tuple[str, ...]], escape: bool = True) -> str:
+    written = [tuple(map(_escaped, row)) if escape else row for row in (head, *rows)]
+    lines = [f"| {' | '.join(row)} |" for row in written]
+    return "\n".join([lines[0], "|---" * len(head) + "|", *lines[1:]])
+
+
+def _bold(text: str, marked: bool) -> str:
+    return f"**{text}**" if marked else text
+
+
+def _escaped(text: str) -> str:
+    return re.sub(r"([\\`*_<>|\[\]])", r"\\\1", " ".join(text.split()).replace(formats.SPACE, " "))
+
+
+def comma_separated(table: Table) -> str:
+    """Return one line per cell in CSV, with all its figures in full."""
+    written = io.StringIO()
+    writer = csv.writer(written, lineterminator="\n")
+    writer.writerow(["experiment", "row", "method", "title", "seed", *COLUMNS, "published"])
+    records = table.records
+    order = {place: i for i, place in enumerate(table.entries)}
+    for cell in sorted(records.cells, key=lambda cell: (order[cell.row, cell.method], cell.seed)):
+        published = records.published.get(cell.row, {}).get(cell.method)
+        figures = [getattr(cell, name) for name in COLUMNS]
+        place = [records.experiment, cell.row, cell.method, records.methods[cell.method], cell.seed]
+        writer.writerow([*place, *figures, published])
+    return written.getvalue()
+
+
+def latex(table: Table) -> str:
+    """Return the table in LaTeX, for the packages booktabs and, if it is wide, graphicx."""
+    records = table.records
+    lines = [
+        r"% Needs \usepackage{booktabs}.",
+        r"\begin{table}",
+        r"\centering",
+        rf"\caption{{{_tex(' '.join((records.caption, explained(table).replace('Marked', 'Bold'))).strip())}}}",
+        rf"\label{{tab:{re.sub(r'[^A-Za-z0-9-]+', '-', records.experiment)}}}",
+        rf"\begin{{tabular}}{{l{'r' * len(records.methods)}}}",
+        r"\toprule",
+        " & ".join(("", *map(_tex, records.methods.values()))) + r" \\",
+        r"\midrule",
+    ]
+    for row in records.rows:
+        cells = []
+        for entry in _entries(table, row):
+            mark = table.marked.get((row, entry.method))
+            cell = [_tex_bold(mean(table, entry), mark == "found"), _tex(deviation(table, entry))]
+            if entry.published is not None:
+                cell.append(f"({_tex_bold(table.measure.shown(entry.published), mark == 'published')})")
+            cells.append(" ".join(part for part in cell if part))
+        lines.append(" & ".join((_tex(row), *cells)) + r" \\")
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
+
+
+def _tex_bold(text: str, marked: bool) -> str:
+    return rf"\textbf{{{_tex(text)}}}" if marked else _tex(text)
+
+
+SYMBOLS = {
+    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", "λ": r"$\lambda$",
+    "→": r"$\to$", "–": "--", formats.SPACE: "~", "“": "``", "”": "''", "<": r"$<$", ">": r"$>$",
+} | {sign: f"\\{sign}" for sign in "&%$#_{}"}  # fmt: skip
+
+
+def _tex(text: str) -> str:
+    return "".join(SYMBOLS.get(character, character) for character in text)
