@@ -84,7 +84,7 @@ def _normalized(table: Table) -> Grid:
             random, expert = (
                 formats.returned(known.get(row)) for known in (records.random_return, records.expert_return)
             )
-            cells = [formats.UNKNOWN if each is None else f"{each.mean():.1f}" for each in scores]
+            cells = [formats.UNKNOWN if each is None else f"{np.mean(list(each.values())):.1f}" for each in scores]
             rows.append((row, random, expert, *cells))
     if rows and any(table.overall(method) for method in records.methods):
         rows.append(("all rows, interquartile mean", "", "", *(_overall(table, method) for method in records.methods)))

@@ -78,7 +78,7 @@ class TablePage:
 def context(table: Table) -> TablePage:
     """Return everything that the page shows of a table, with its figures drawn."""
     records, looks = table.records, method_looks(table)
-    total = len(records.rows) * len(records.methods) * len(records.seeds)
+    total = sum(entry.planned for entry in table.entries.values())
     entries = {row: [table.entries[row, method] for method in records.methods] for row in records.rows}
     return TablePage(
         name=records.experiment,

@@ -102,6 +102,9 @@ class Records(Held):
             if place in places:
                 raise ValueError(f"cell {place} is there twice")
             places.add(place)
+        for row, method, seed in (*self.missing, *((each.row, each.method, each.seed) for each in self.failed)):
+            if row not in self.rows or method not in (None, *self.methods) or seed not in self.seeds:
+                raise ValueError(f"what is missing or failed, {(row, method, seed)}, is in no cell of the table")
         return self
 
 

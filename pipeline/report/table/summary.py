@@ -15,7 +15,6 @@ from oodil.pipeline.report import formats
 from oodil.pipeline.report.table.records import RESULTS, Records
 from oodil.pipeline.statistics import (
     ENOUGH_SEEDS,
-    Floats,
     Statistics,
     interquartile_mean,
     interval,
@@ -76,6 +75,8 @@ class Entry:
     published: float | None
     found: Statistics | None
     """None while no seed has a figure."""
+    planned: int
+    """How many seeds it is to have."""
 
 
 @dataclass(frozen=True)
@@ -119,15 +120,30 @@ class Table:
     @cached_property
     def entries(self) -> dict[tuple[str, str], Entry]:
         """All entries by row and method, in the order of the table."""
-        found = {}
+        found, planned = {}, self._planned()
         for row in self.records.rows:
             for method in self.records.methods:
                 by_seed = self.by_seed(row, method, self.records.figure)
                 values = np.array(list(by_seed.values()))
                 published = self.records.published.get(row, {}).get(method)
                 statistics = Statistics.of(values) if by_seed else None
-                found[row, method] = Entry(row, method, by_seed, published, statistics)
+                found[row, method] = Entry(row, method, by_seed, published, statistics, len(planned[row, method]))
         return found
+
+    def _planned(self) -> dict[tuple[str, str], set[int]]:
+        """Return the seeds that each row and method has or is to have; rows may differ in them."""
+        records = self.records
+        seeds: dict[tuple[str, str], set[int]] = {
+            (row, name): set() for row in records.rows for name in records.methods
+        }
+        for cell in records.cells:
+            seeds[cell.row, cell.method].add(cell.seed)
+        for row, method, seed in records.missing:
+            seeds[row, method].add(seed)
+        for failure in records.failed:
+            for method in [failure.method] if failure.method else records.methods:
+                seeds[failure.row, method].add(failure.seed)
+        return seeds
 
     def by_seed(self, row: str, method: str, figure: str) -> dict[int, float]:
         """Return a figure of a row and method by seed, where it is known."""
@@ -172,27 +188,30 @@ class Table:
         probability = probability_of_improvement(ours, theirs)
         return probability if self.measure.higher_is_better else 1 - probability
 
-    def normalized(self, row: str, method: str) -> Floats | None:
-        """Return the returns (N,) of a row and method, 0 for a random policy and 100 for the target's own expert.
+    def normalized(self, row: str, method: str) -> dict[int, float] | None:
+        """Return the returns of a row and method by seed, 0 for a random policy and 100 for the target's own expert.
 
         None where one of the two is not known, or the expert is no better.
         """
         random, expert = self.records.random_return.get(row), self.records.expert_return.get(row)
-        returns = np.array(list(self.by_seed(row, method, "mean_return").values()))
-        if random is None or expert is None or not expert > random or not len(returns):
+        returns = self.by_seed(row, method, "mean_return")
+        if random is None or expert is None or not expert > random or not returns:
             return None
-        return 100 * normalized(returns, random, expert)
+        scores = 100 * normalized(np.array(list(returns.values())), random, expert)
+        return dict(zip(returns, scores.tolist(), strict=True))
 
     def overall(self, method: str) -> tuple[float, tuple[float, float] | None] | None:
         """Return the interquartile mean of the normalized returns (T, N) of all rows, and its interval.
 
-        There is no interval with fewer than five seeds, and nothing unless every row has equally many seeds.
+        The seeds are those that every row has. There is no interval with fewer than five, and nothing with none.
         """
         each = [self.normalized(row, method) for row in self.records.rows]
-        known = [scores for scores in each if scores is not None]
-        if len(known) < max(2, len(each)) or len({len(scores) for scores in known}) > 1:
+        if len(each) < 2 or any(scores is None for scores in each):
             return None
-        scores = np.stack(known)
+        common = sorted(set.intersection(*(set(scores) for scores in each if scores)))
+        if not common:
+            return None
+        scores = np.array([[known[seed] for seed in common] for known in each if known])
         return interquartile_mean(scores), interval(scores) if scores.shape[1] >= ENOUGH_SEEDS else None
 
     def sources(self, row: str, method: str) -> Iterator[tuple[str, float | None, float | None]]:

@@ -3,6 +3,8 @@
 import csv
 import io
 import re
+import shlex
+from collections.abc import Sequence
 from typing import Any
 
 from oodil.pipeline.report import formats
@@ -35,8 +37,8 @@ def over_seeds(table: Table, entry: Entry) -> str:
         said = f"IQM {shown(entry.found.interquartile_mean)} ({shown(low)} to {shown(high)})"
     else:
         said = " · ".join(map(shown, entry.by_seed.values()))
-    fewer = len(entry.by_seed) < len(table.records.seeds)
-    return f"{said}, {len(entry.by_seed)} of {len(table.records.seeds)} seeds" if fewer else said
+    fewer = len(entry.by_seed) < entry.planned
+    return f"{said}, {len(entry.by_seed)} of {entry.planned} seeds" if fewer else said
 
 
 def explained(table: Table) -> str:
@@ -55,6 +57,8 @@ def how_made(made: dict[str, Any]) -> str:
     """Return one line on what is known of how the experiment was made; nothing where nothing is."""
     parts = []
     for key, value in made.items():
+        if key == "command" and isinstance(value, list):
+            value = shlex.join(map(str, value))
         name = re.sub(r" per s$", " per second", key.replace("_", " "))
         if isinstance(value, dict) and "seconds" in key and value and all(_is_number(each) for each in value.values()):
             total = sum(value.values())
@@ -77,15 +81,21 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def markdown(table: Table, level: int = 1) -> str:
-    """Return the whole of the table's page that is not a figure; its title is a heading of the given level."""
+def markdown(table: Table, level: int = 1, below: str = "") -> str:
+    """Return the whole of the table's page that is not a figure.
+
+    Args:
+        level: Of the heading that is its title.
+        below: What stands below the table itself, such as figures.
+    """
     records, heading = table.records, "#" * level
     parts = [f"{heading} {_escaped(records.experiment)}", _escaped(records.caption), main_table(table)]
     parts.append(_escaped(explained(table)))
     parts.append("\n".join(f"* {_escaped(line)}" for line in (*findings(table), *notes(table))))
+    parts.append(below)
     parts.append(f"{heading}# Over seeds")
     head = ("", *records.methods.values())
-    parts.append(_lines(head, [(row, *(over_seeds(table, e) for e in _entries(table, row))) for row in records.rows]))
+    parts.append(lines(head, [(row, *(over_seeds(table, e) for e in _entries(table, row))) for row in records.rows]))
     for grid in grids(table):
         parts += [f"{heading}# {grid.title}", _escaped(grid.caption), grid_table(grid)]
     made = how_made(records.made)
@@ -107,22 +117,23 @@ def main_table(table: Table) -> str:
             cells.append(" ".join(part for part in cell if part))
         rows.append((_escaped(row), *cells))
     head = tuple(map(_escaped, ("", *records.methods.values())))
-    return _lines(head, rows, escape=False)
+    return lines(head, rows, escape=False)
 
 
 def grid_table(grid: Grid) -> str:
     """Return a grid in Markdown."""
-    return _lines(grid.head, list(grid.rows))
+    return lines(grid.head, grid.rows)
 
 
 def _entries(table: Table, row: str) -> list[Entry]:
     return [table.entries[row, method] for method in table.records.methods]
 
 
-def _lines(head: tuple[str, ...], rows: list[tuple[str, ...]], escape: bool = True) -> str:
+def lines(head: tuple[str, ...], rows: Sequence[tuple[str, ...]], escape: bool = True) -> str:
+    """Return a table of text in Markdown."""
     written = [tuple(map(_escaped, row)) if escape else row for row in (head, *rows)]
-    lines = [f"| {' | '.join(row)} |" for row in written]
-    return "\n".join([lines[0], "|---" * len(head) + "|", *lines[1:]])
+    first, *rest = (f"| {' | '.join(row)} |".replace(formats.SPACE, " ") for row in written)
+    return "\n".join([first, "|---" * len(head) + "|", *rest])
 
 
 def _bold(text: str, marked: bool) -> str:
@@ -130,7 +141,7 @@ def _bold(text: str, marked: bool) -> str:
 
 
 def _escaped(text: str) -> str:
-    return re.sub(r"([\\`*_<>|\[\]])", r"\\\1", " ".join(text.split()).replace(formats.SPACE, " "))
+    return re.sub(r"([\\`*_<>|\[\]])", r"\\\1", " ".join(text.split()))
 
 
 def comma_separated(table: Table) -> str:
@@ -151,7 +162,7 @@ def comma_separated(table: Table) -> str:
 def latex(table: Table) -> str:
     """Return the table in LaTeX, for the packages booktabs and, if it is wide, graphicx."""
     records = table.records
-    lines = [
+    written = [
         r"% Needs \usepackage{booktabs}.",
         r"\begin{table}",
         r"\centering",
@@ -170,8 +181,8 @@ def latex(table: Table) -> str:
             if entry.published is not None:
                 cell.append(f"({_tex_bold(table.measure.shown(entry.published), mark == 'published')})")
             cells.append(" ".join(part for part in cell if part))
-        lines.append(" & ".join((_tex(row), *cells)) + r" \\")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
+        written.append(" & ".join((_tex(row), *cells)) + r" \\")
+    return "\n".join([*written, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
 
 
 def _tex_bold(text: str, marked: bool) -> str:

@@ -1,0 +1,127 @@
+"""Write docs/results.md, and its figures, from the committed results: nothing in them is typed by hand.
+
+Every experiment is a folder of benchmarks/results/experiments/ with the results.json and made.json that `oodil table`
+wrote; a notes.md beside them says why something is as it is.
+
+Run ``python docs/make_results.py``.
+"""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from oodil.pipeline.report import formats
+from oodil.pipeline.report.table import Table, read_table
+from oodil.pipeline.report.table.figures import plots
+from oodil.pipeline.report.table.grids import findings
+from oodil.pipeline.report.table.texts import lines, markdown
+
+ROOT = Path(__file__).parents[1]
+MEASURED = ROOT / "benchmarks" / "results"
+EXPERIMENTS = MEASURED / "experiments"
+PAGE, FIGURES = ROOT / "docs" / "results.md", ROOT / "docs" / "results"
+
+HEAD = """# Results
+
+This page is written by `python docs/make_results.py` from the files of
+[benchmarks/results](../benchmarks/results). Returns are of the last policy's mean actions. With five seeds
+or more there is the interquartile mean (IQM) with its 95 % interval; fewer are listed and have none.
+Earlier runs, with other settings, are in
+[measurements.md](measurements.md#whole-runs-before-experiments-were-files)."""
+
+
+def tables(folder: Path = EXPERIMENTS) -> dict[str, Table]:
+    """Return the tables of all committed experiments by the name of their folders, tables before figures."""
+    folders = [path.parent for path in folder.glob("*/results.json")]
+    ordered = sorted(folders, key=lambda path: (not path.name.startswith("table"), path.name))
+    return {path.name: read_table(path) for path in ordered}
+
+
+def page(folder: Path = EXPERIMENTS) -> str:
+    """Return the whole page in Markdown."""
+    held = tables(folder)
+    parts = [HEAD, *summary(held)]
+    for name, table in held.items():
+        pictures = "\n\n".join(f"![{plot.name}: {name}](results/{name}-{plot.name}.svg)" for plot in plots(table))
+        notes = folder / name / "notes.md"
+        reasons = f"### Why\n\n{notes.read_text(encoding='utf-8').strip()}" if notes.is_file() else ""
+        parts.append(markdown(table, level=2, below="\n\n".join(part for part in (pictures, reasons) if part)).strip())
+    parts.append(speed())
+    return "\n\n".join(parts) + "\n"
+
+
+def summary(held: dict[str, Table]) -> Iterator[str]:
+    """Yield what the experiments say together: the state of each, and every published figure of ours beside ours."""
+    if not held:
+        yield "No experiment is committed yet."
+        return
+    for name, table in held.items():
+        said = " ".join(findings(table)) or "Nothing to compare yet."
+        done = len(table.records.cells)
+        planned = sum(entry.planned for entry in table.entries.values())
+        state = "" if done == planned else f" {done} of {formats.plural(planned, 'cell')}."
+        yield f"**[{name}](#{table.records.experiment.lower().replace('.', '')})**:{state} {said}"
+    better: list[tuple[str, ...]] = []
+    worse: list[tuple[str, ...]] = []
+    for name, table in held.items():
+        for row in table.records.rows:
+            entry = table.entries[row, table.ours]
+            if entry.found and entry.published is not None:
+                shown, difference = table.measure.shown, entry.found.mean - entry.published
+                line = (
+                    f"{name}, {row}",
+                    shown(entry.found.mean),
+                    shown(entry.published),
+                    f"{'+' if difference >= 0 else '−'}{shown(abs(difference))}",
+                    ", ".join(shown(value) for value in entry.by_seed.values()),
+                )
+                (better if table.marked[row, table.ours] == "found" else worse).append(line)
+    head = ("experiment, row", "ours", "paper", "difference", "seeds")
+    if better:
+        yield "## At or above the paper"
+        yield lines(head, better)
+    if worse:
+        yield "## Below the paper"
+        yield "Reasons, where they were found, stand with each experiment."
+        yield lines(head, worse)
+
+
+def speed() -> str:
+    """Return how fast one core of the machine is that measured throughput."""
+    throughput = json.loads((MEASURED / "throughput.json").read_text())
+    batched = json.loads((MEASURED / "environments.json").read_text())["environments"]
+    names = list(batched)
+    raw = {name.removeprefix("oodil/").removesuffix("-v0"): each for name, each in throughput["stepping"].items()}
+    rows = [
+        ("raw `mj_step`", *(f"{raw[name]['raw_steps_per_s']:,.0f}" if name in raw else "–" for name in names)),
+        ("batched", *(f"{each['batched_steps_per_s']:,.0f}" for each in batched.values())),
+    ]
+    machine, versions = throughput["machine"], throughput["versions"]
+    made = f"{machine['cores']} cores of {machine['cpu']}, " + ", ".join(f"{k} {v}" for k, v in versions.items())
+    sources = "[throughput.json](../benchmarks/results/throughput.json), "
+    sources += "[environments.json](../benchmarks/results/environments.json)"
+    title = f"## Speed of one core\n\nSteps per second: {sources}; {made}."
+    return f"{title}\n\n{lines(('', *names), rows, escape=False)}"
+
+
+def figures(folder: Path = EXPERIMENTS) -> dict[str, str]:
+    """Return all figures in SVG by the names of their files."""
+    return {
+        f"{name}-{plot.name}.svg": plot.sheet(table) for name, table in tables(folder).items() for plot in plots(table)
+    }
+
+
+def main() -> None:
+    """Write the page and its figures; figures that it no longer has are removed."""
+    PAGE.write_text(page(), encoding="utf-8")
+    shutil.rmtree(FIGURES, ignore_errors=True)
+    drawn = figures()
+    if drawn:
+        FIGURES.mkdir()
+    for name, svg in drawn.items():
+        (FIGURES / name).write_text(svg + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
