@@ -73,7 +73,7 @@ def summary(held: dict[str, Table]) -> Iterator[str]:
                     f"{name}, {row}",
                     shown(entry.found.mean),
                     shown(entry.published),
-                    f"{'+' if difference >= 0 else '−'}{shown(abs(difference))}",
+                    f"{'+' if difference >= 0 else '−'}{table.measure.deviation(abs(difference), entry.published)}",
                     ", ".join(shown(value) for value in entry.by_seed.values()),
                 )
                 (better if table.marked[row, table.ours] == "found" else worse).append(line)

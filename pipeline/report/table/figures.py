@@ -71,6 +71,7 @@ class Plot:
         rows = -(-len(self.panels) // columns)
         with drawing(self.name, PANEL * columns, 0.3 + (self.height + 0.3) * rows) as (figure, svg):
             figure.set_facecolor("white")
+            figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.1)
             grid = figure.subplots(rows, columns, squeeze=False)
             for axes in grid.flat[len(self.panels) :]:
                 axes.set_visible(False)

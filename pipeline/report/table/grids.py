@@ -190,5 +190,5 @@ def _beyond(table: Table, row: str, method: str) -> bool:
 
 
 def _counted(what: str, total: int, exceptions: list[str], lead: str) -> str:
-    said = f"{what} in {total - len(exceptions)} of {formats.plural(total, 'row')}."
+    said = f"{what} in {total - len(exceptions)} of {total} rows."
     return f"{said} {lead}: {', '.join(exceptions)}." if exceptions else said

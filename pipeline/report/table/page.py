@@ -19,7 +19,7 @@ CAPTIONS = {
     "sweep": "Every point is a seed; lines join means. Hollow diamonds: published figures.",
     "clusters": "Clusters that are not empty, a point per seed.",
     "curves": "True return of the mean action in the imitator's environment: the mean over seeds, and a band of one "
-    "standard deviation over seeds. Dashed: the oracle.",
+    "standard deviation over seeds.",
 }
 TITLES = {"seeds": "Every seed", "sweep": "Over the values", "clusters": "Clusters", "curves": "Learning curves"}
 

@@ -151,11 +151,16 @@ class Table:
         values = {cell.seed: getattr(cell, figure) for cell in mine}
         return {seed: float(values[seed]) for seed in sorted(values) if values[seed] is not None}
 
+    @property
+    def marks_rows(self) -> bool:
+        """Whether it is the best of each row that is marked."""
+        return not self.records.published and len(self.records.methods) > 1
+
     @cached_property
     def marked(self) -> dict[tuple[str, str], str]:
         """Which figure of an entry is marked, by row and method: ours (``found``) or the paper's (``published``).
 
-        It is the better of the two; in a table without published figures, the best entry of each row.
+        It is the better of the two; in a table without published figures, the best entry of each row with several.
         """
         marks = {}
         for row in self.records.rows:
@@ -163,7 +168,7 @@ class Table:
             means = {method: entry.found.mean for method, entry in entries.items() if entry.found}
             for method, mean in means.items():
                 published = entries[method].published
-                if not self.records.published and mean == self.measure.best(*means.values()):
+                if self.marks_rows and mean == self.measure.best(*means.values()):
                     marks[row, method] = "found"
                 elif published is not None:
                     better = self.measure.best(mean, published)

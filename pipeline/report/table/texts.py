@@ -47,8 +47,10 @@ def explained(table: Table) -> str:
     seeds = ", ".join(map(str, records.seeds))
     said = f"{table.measure.title.capitalize() if table.measure.title != 'AUROC' else 'AUROC'}: mean ± standard "
     said += f"deviation over seed{'s' * (len(records.seeds) > 1)} {seeds}. "
-    if not records.published:
+    if table.marks_rows:
         return said + "Marked: the best of each row."
+    if not records.published:
+        return said.rstrip()
     source = f" ({records.source})" if records.source else ""
     return said + f"In parentheses: the published figure{source}. Marked: the better of the two."
 
