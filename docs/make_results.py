@@ -25,7 +25,7 @@ PAGE, FIGURES = ROOT / "docs" / "results.md", ROOT / "docs" / "results"
 HEAD = """# Results
 
 This page is written by `python docs/make_results.py` from the files of
-[benchmarks/results](../benchmarks/results). Returns are of the last policy's mean actions. With five seeds
+`benchmarks/results/`. Returns are of the last policy's mean actions. With five seeds
 or more there is the interquartile mean (IQM) with its 95 % interval; fewer are listed and have none.
 Earlier runs, with other settings, are in
 [measurements.md](measurements.md#whole-runs-before-experiments-were-files)."""

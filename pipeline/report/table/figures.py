@@ -20,7 +20,7 @@ from oodil.pipeline.report.looks import INK, MARKERS, MUTED, POLICIES
 from oodil.pipeline.report.table.summary import ORACLE, Entry, Measure, Sweep, Table
 from oodil.pipeline.statistics import Floats
 
-PANEL, MOST_COLUMNS = 4.4, 3
+PANEL, MOST_COLUMNS = 4.4, 2
 """Width of a panel in inches, and the most panels beside each other on a sheet."""
 LINE = 0.4
 """Height in inches of a method in a panel of seeds."""
@@ -249,4 +249,4 @@ def _legend(figure: Figure, table: Table) -> None:
         for look in method_looks(table).values()
     ]
     titles = [table.records.methods[method] for method in method_looks(table)]
-    figure.legend(handles, titles, loc="outside lower left", ncols=4, frameon=False)
+    figure.legend(handles, titles, loc="outside lower left", ncols=3, frameon=False)
