@@ -44,6 +44,8 @@ class DemonstrationsConfig(Section):
 
     file: Path | None = None
     """A saved set, relative to the configuration file."""
+    marks: dict[str, bool] = Field(default={})
+    """By label, whether the imitator can reproduce a source in the file, if known; as `transferable` of `sources`."""
     sources: tuple[SourceConfig, ...] = ()
     """Demonstrators to collect from."""
     deterministic: bool = False
@@ -58,6 +60,8 @@ class DemonstrationsConfig(Section):
     def _one_origin(self) -> "DemonstrationsConfig":
         if (self.file is None) == (not self.sources):
             raise ValueError("give either file or sources")
+        if self.marks and self.sources:
+            raise ValueError("marks are of the sources in a file; those listed here have a field `transferable` each")
         labels = [source.label for source in self.sources]
         if len(set(labels)) != len(labels):
             raise ValueError(f"two sources have the same label: {labels}")

@@ -97,9 +97,11 @@ def load_demonstrations(run: Run) -> Demonstrations:
     return replace(held, source_labels=labels) if labels else held
 
 
-def transferable_marks(config: RunConfig) -> list[bool | None]:
-    """Return whether each source is marked transferable, by source; empty for demonstrations from a file."""
-    return [source.transferable for source in config.demonstrations.sources]
+def transferable_marks(config: RunConfig) -> dict[str, bool | None]:
+    """Return by label whether a source is marked transferable; those of the run that is continued have its marks."""
+    section, base = config.demonstrations, base_run(config)
+    known = {} if base is None else transferable_marks(base.config)
+    return known | {source.label: source.transferable for source in section.sources} | section.marks
 
 
 def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
@@ -114,6 +116,12 @@ def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
             )
         if environment and environment != config.environment.id:
             raise DataError(f"{section.file}: recorded in {environment}, but the run is for {config.environment.id}")
+        base = base_run(config)
+        labels = (*demonstrations.source_labels, *(load_demonstrations(base).source_labels if base else ()))
+        unknown = [label for label in section.marks if label not in labels]
+        if unknown:
+            known = ", ".join(repr(label) for label in dict.fromkeys(labels))
+            raise DataError(f"demonstrations.marks: no source {unknown[0]!r} in {section.file}; it has {known}")
     for source in section.sources:
         check_expert(source, EnvironmentConfig(id=config.environment.id, dynamics=source.dynamics), observation_dim)
 
