@@ -26,6 +26,7 @@ from oodil.pipeline.loading import parse_config
 from oodil.pipeline.stage import Run, Stage, state_of
 from oodil.pipeline.stages import stages
 from oodil.pipeline.stages.demonstrations import check_demonstrations
+from oodil.pipeline.stages.oracle_target import TargetDemonstrationsStage, check_target
 from oodil.pipeline.versions import library_versions
 from oodil.workers.engine import Engine, Outcome
 from oodil.workers.reports import Event
@@ -113,6 +114,8 @@ def check_inputs(config: RunConfig) -> None:
     for source in config.demonstrations.sources:
         check_environment(config.environment.id, source.dynamics)
     check_demonstrations(config, spec.observation_dim)
+    if TargetDemonstrationsStage.name in [stage.name for stage in stages(config)]:
+        check_target(config, spec.observation_dim)
 
 
 def choose(config: RunConfig, until: str | None = None) -> list[Stage]:

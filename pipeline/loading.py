@@ -152,10 +152,10 @@ def _models(field: Any) -> list[type[BaseModel]]:
 def _resolve_paths(config: RunConfig, base: Path) -> RunConfig:
     demonstrations = config.demonstrations
     file = base / demonstrations.file if demonstrations.file else None
-    sources = tuple(
-        source.model_copy(update={"expert": base / source.expert_folder}) if source.expert_folder else source
-        for source in demonstrations.sources
-    )
+    sources = tuple(source.relative_to(base) for source in demonstrations.sources)
     return config.model_copy(
-        update={"demonstrations": demonstrations.model_copy(update={"file": file, "sources": sources})}
+        update={
+            "demonstrations": demonstrations.model_copy(update={"file": file, "sources": sources}),
+            "oracle_target": config.oracle_target.relative_to(base) if config.oracle_target else None,
+        }
     )

@@ -171,10 +171,9 @@ class RunResults:
 
     def marks(self) -> NDArray[np.bool_] | None:
         """Return (N,) whether each demonstration's source is marked transferable; None unless all are marked."""
-        marks = transferable_marks(self.config)
-        if not marks or None in marks:
-            return None
-        return np.array(marks, np.bool_)[self.demonstrations.sources]
+        known, demonstrations = transferable_marks(self.config), self.demonstrations
+        marks = [known.get(label) for label in demonstrations.source_labels]
+        return None if None in marks else np.array(marks, np.bool_)[demonstrations.sources]
 
     def separation(self, weighting: str = "transferability") -> dict[str, float]:
         """Return how well a weighting tells what is marked transferable from what is marked not to be.
@@ -283,9 +282,13 @@ class RunResults:
 def separation_metrics(
     marks: NDArray[np.bool_], scores: NDArray[np.float64], weights: NDArray[np.float64], demonstrations: Demonstrations
 ) -> dict[str, float]:
-    """Return what `RunResults.separation` does for (N,) marks of both kinds, scores and weights."""
+    """Return what `RunResults.separation` does for (N,) marks of both kinds, scores and weights.
+
+    What is unlike all that is known has no score, and counts as 0.
+    """
     from sklearn.metrics import roc_auc_score
 
+    scores = np.nan_to_num(scores)
     by_share = {"share_before": np.ones(len(demonstrations)), "share": weights}
     by_share |= {f"share_power_{power}": scores**power + 1e-300 for power in POWERS}
     shares = {name: float(sampling_mass(w, demonstrations)[marks].sum()) for name, w in by_share.items()}

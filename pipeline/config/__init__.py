@@ -4,7 +4,7 @@ Every field has a type, a default where one is sensible, and a line below it. No
 """
 
 from oodil.pipeline.config.clustering import CLUSTERING_PRESETS, ClusteringConfig
-from oodil.pipeline.config.demonstrations import DemonstrationsConfig, SourceConfig
+from oodil.pipeline.config.demonstrations import DemonstrationsConfig, ExpertConfig, SourceConfig
 from oodil.pipeline.config.methods import (
     FeasibilityConfig,
     FinetuningConfig,
@@ -33,6 +33,7 @@ __all__ = [
     "DiscriminatorConfig",
     "EnvironmentConfig",
     "EvaluationConfig",
+    "ExpertConfig",
     "FeasibilityConfig",
     "FinetuningConfig",
     "GailConfig",

@@ -1,33 +1,42 @@
 """What is imitated: demonstrators, or a file."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import Field, PositiveInt, model_validator
 
 from oodil.pipeline.config.sections import Section, UnitInterval
 
 
-class SourceConfig(Section):
+class ExpertConfig(Section):
+    """Who demonstrates, and how often."""
+
+    expert: Literal["hand-written"] | Path
+    """Folder of a saved expert, relative to the configuration file, or the controller that the environment brings."""
+    count: PositiveInt
+    """Demonstrations to collect."""
+
+    @property
+    def expert_folder(self) -> Path | None:
+        """The folder of a saved expert; None for a hand-written controller."""
+        return self.expert if isinstance(self.expert, Path) else None
+
+    def relative_to(self, base: Path) -> Self:
+        """Return it with an expert that is found from anywhere: so far its folder is relative to ``base``."""
+        return self.model_copy(update={"expert": base / self.expert}) if isinstance(self.expert, Path) else self
+
+
+class SourceConfig(ExpertConfig):
     """One demonstrator: its dynamics, its expert and how many of its demonstrations are used."""
 
     label: str
     """Its name in reports."""
     dynamics: dict[str, float] = Field(default={})
     """Keyword arguments of the environment: the demonstrator's own dynamics."""
-    expert: Literal["hand-written"] | Path
-    """Folder of a saved expert, relative to the configuration file, or the controller that the environment brings."""
     expert_discount: UnitInterval = 0.995
     """Discount with which its expert is trained; flights are long under low gravity and want a longer horizon."""
-    count: PositiveInt
-    """Demonstrations to collect."""
     transferable: bool | None = None
     """Whether the imitator can reproduce it, if known: for the report and the oracle, never an input of the method."""
-
-    @property
-    def expert_folder(self) -> Path | None:
-        """The folder of a saved expert; None for a hand-written controller."""
-        return self.expert if isinstance(self.expert, Path) else None
 
 
 class DemonstrationsConfig(Section):
@@ -35,6 +44,8 @@ class DemonstrationsConfig(Section):
 
     file: Path | None = None
     """A saved set, relative to the configuration file."""
+    marks: dict[str, bool] = Field(default={})
+    """By label, whether the imitator can reproduce a source in the file, if known; as `transferable` of `sources`."""
     sources: tuple[SourceConfig, ...] = ()
     """Demonstrators to collect from."""
     deterministic: bool = False
@@ -49,6 +60,8 @@ class DemonstrationsConfig(Section):
     def _one_origin(self) -> "DemonstrationsConfig":
         if (self.file is None) == (not self.sources):
             raise ValueError("give either file or sources")
+        if self.marks and self.sources:
+            raise ValueError("marks are of the sources in a file; those listed here have a field `transferable` each")
         labels = [source.label for source in self.sources]
         if len(set(labels)) != len(labels):
             raise ValueError(f"two sources have the same label: {labels}")

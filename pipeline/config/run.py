@@ -5,7 +5,7 @@ from typing import Any, Literal
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from oodil.pipeline.config.clustering import CLUSTERING_PRESETS, ClusteringConfig
-from oodil.pipeline.config.demonstrations import DemonstrationsConfig
+from oodil.pipeline.config.demonstrations import DemonstrationsConfig, ExpertConfig
 from oodil.pipeline.config.methods import (
     FeasibilityConfig,
     FinetuningConfig,
@@ -107,13 +107,17 @@ class RunConfig(Section):
     """How the baselines `f_mdp` and `f_mdp_per_source` weigh demonstrations."""
     inverse_dynamics: InverseDynamicsConfig = InverseDynamicsConfig()
     """The competing method ID, for runs that have `id_random` or `id_gail` among their baselines."""
+    oracle_target: ExpertConfig | None = None
+    """An expert of the imitator's own dynamics, for runs that have `oracle_target` among their baselines. Its
+    demonstrations are collected as those of `demonstrations.sources` are, and never mixed with them."""
     imitation: ImitationConfig
     """The final policy."""
     finetuning: FinetuningConfig = FinetuningConfig()
     """A continuation of a finished run."""
     baselines: tuple[str, ...] = ()
-    """Policies that are trained beside it for comparison: `naive_gail`, `naive_gail_all_steps`, `oracle`, `f_mdp`,
-    `f_mdp_per_source`, `id_random`, `id_gail`, `exact_id`, or `module:name` for one that another module registers."""
+    """Policies that are trained beside it for comparison: `naive_gail`, `naive_gail_all_steps`, `oracle`,
+    `oracle_target`, `f_mdp`, `f_mdp_per_source`, `id_random`, `id_gail`, `exact_id`, or `module:name` for one that
+    another module registers."""
     evaluation: EvaluationConfig = EvaluationConfig()
     """What is measured beside the training."""
     runtime: RuntimeConfig = RuntimeConfig()

@@ -69,7 +69,8 @@ def read_sources(results: RunResults) -> Sources | None:
         return None
     demonstrations = results.demonstrations
     labels = demonstrations.source_labels
-    marks = transferable_marks(results.config) or [None] * len(labels)
+    known = transferable_marks(results.config)
+    marks = [known.get(label) for label in labels]
     columns = zip(labels, marks, source_looks(marks), strict=True)
     each = []
     for i, (label, transferable, look) in enumerate(columns):

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from oodil.pipeline.artifacts import Files
-from oodil.pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
+from oodil.pipeline.config import DemonstrationsConfig, EnvironmentConfig, ExpertConfig, RunConfig
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.datasets import read_demonstrations, read_file
 from oodil.pipeline.environments import Simulators, make_batch
@@ -40,11 +40,10 @@ class DemonstrationsStage(Stage):
             before = {} if base is None else {"base": base.artifact(self.name).sha256}
             return common | before | {"file_sha256": hashlib.sha256(read_file(section.file)).hexdigest()}
         sources = [
-            {"dynamics": source.dynamics, "count": source.count, "expert_sha256": _identity(source)}
+            {"dynamics": source.dynamics, "count": source.count, "expert_sha256": identity(source)}
             for source in section.sources
         ]
-        flags = section.model_dump(include={"deterministic", "full_length_only", "minimum_return"})
-        return common | flags | {"sources": sources, "imitator": config.environment.dynamics}
+        return common | flags(section) | {"sources": sources, "imitator": config.environment.dynamics}
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the settings without the imitator's dynamics, in which `combine` alone runs experts."""
@@ -73,10 +72,8 @@ class DemonstrationsStage(Stage):
                 index,
                 source.count,
                 config.seed,
-                deterministic=section.deterministic,
-                full_length_only=section.full_length_only,
-                minimum_return=section.minimum_return,
                 context=context,
+                **flags(section),
             )
         except DataError as error:
             raise DataError(f"source {source.label!r}: {error}") from error
@@ -100,9 +97,11 @@ def load_demonstrations(run: Run) -> Demonstrations:
     return replace(held, source_labels=labels) if labels else held
 
 
-def transferable_marks(config: RunConfig) -> list[bool | None]:
-    """Return whether each source is marked transferable, by source; empty for demonstrations from a file."""
-    return [source.transferable for source in config.demonstrations.sources]
+def transferable_marks(config: RunConfig) -> dict[str, bool | None]:
+    """Return by label whether a source is marked transferable; those of the run that is continued have its marks."""
+    section, base = config.demonstrations, base_run(config)
+    known = {} if base is None else transferable_marks(base.config)
+    return known | {source.label: source.transferable for source in section.sources} | section.marks
 
 
 def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
@@ -117,16 +116,27 @@ def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
             )
         if environment and environment != config.environment.id:
             raise DataError(f"{section.file}: recorded in {environment}, but the run is for {config.environment.id}")
+        base = base_run(config)
+        labels = (*demonstrations.source_labels, *(load_demonstrations(base).source_labels if base else ()))
+        unknown = [label for label in section.marks if label not in labels]
+        if unknown:
+            known = ", ".join(repr(label) for label in dict.fromkeys(labels))
+            raise DataError(f"demonstrations.marks: no source {unknown[0]!r} in {section.file}; it has {known}")
     for source in section.sources:
-        if source.expert_folder is None:
-            hand_written(make_batch(config.environment.id, source.dynamics, 1), config.environment.id)
-            continue
-        policy, _ = load_expert(source.expert_folder)
-        if len(policy.input_mean) != observation_dim:
-            raise DataError(
-                f"{source.expert}: the expert sees {len(policy.input_mean)} dimensions; "
-                f"environment {config.environment.id} has {observation_dim}"
-            )
+        check_expert(source, EnvironmentConfig(id=config.environment.id, dynamics=source.dynamics), observation_dim)
+
+
+def check_expert(section: ExpertConfig, environment: EnvironmentConfig, observation_dim: int) -> None:
+    """Raise DataError or ExpertError if a demonstrator is not there or cannot act in the environment."""
+    if section.expert_folder is None:
+        hand_written(make_batch(environment.id, environment.dynamics, 1), environment.id)
+        return
+    policy, _ = load_expert(section.expert_folder)
+    if len(policy.input_mean) != observation_dim:
+        raise DataError(
+            f"{section.expert}: the expert sees {len(policy.input_mean)} dimensions; "
+            f"environment {environment.id} has {observation_dim}"
+        )
 
 
 def hand_written(simulators: Simulators, env_id: str) -> Controller:
@@ -140,7 +150,7 @@ def hand_written(simulators: Simulators, env_id: str) -> Controller:
 def collect_demonstrations(
     policy: GaussianPolicy | None,
     environment: EnvironmentConfig,
-    source: int,
+    source: int | str,
     count: int,
     seed: int,
     *,
@@ -151,7 +161,8 @@ def collect_demonstrations(
 ) -> tuple[Demonstrations, float]:
     """Collect ``count`` demonstrations and return them with the share of episodes that were kept.
 
-    The number of the ``source`` and the ``seed`` name the random stream; what the source is called does not matter.
+    The ``source``, a number for those of a mixture, and the ``seed`` name the random stream; what the source is called
+    in reports does not matter.
     Without a policy, the environment's hand-written controller acts; it does as it does, ``deterministic`` or not.
 
     Raises DataError when fewer than one episode in ten can be kept.
@@ -181,9 +192,14 @@ def collect_demonstrations(
     return Demonstrations.of(kept[:count], f"source {source}"), share
 
 
-def _identity(source: SourceConfig) -> str:
+def flags(section: DemonstrationsConfig) -> dict[str, Any]:
+    """Return which episodes are collected, and which of them are kept."""
+    return section.model_dump(include={"deterministic", "full_length_only", "minimum_return"})
+
+
+def identity(section: ExpertConfig) -> str:
     """Return what an expert is, whatever its folder is called."""
-    return load_expert(source.expert_folder)[1].sha256 if source.expert_folder else str(source.expert)
+    return load_expert(section.expert_folder)[1].sha256 if section.expert_folder else str(section.expert)
 
 
 register(DemonstrationsStage())

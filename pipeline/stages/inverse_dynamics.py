@@ -31,6 +31,8 @@ from oodil.pipeline.stages.weighting import Weighting, refuse_other_states
 if TYPE_CHECKING:
     from oodil.pipeline.algorithms.inverse_dynamics import Exploration, InverseModel
 
+ABOVE_NOTHING = float(np.nextafter(0.0, 1.0))
+"""The least score that says a demonstration can be followed in part; with a score of 0 it weighs nothing."""
 SIMULATORS = 32
 """Demonstrations that are followed side by side. No result depends on it."""
 
@@ -42,7 +44,7 @@ class InverseDynamics(Weighting):
     again after a stop, to the same bits.
     """
 
-    version = 1
+    version = 2
 
     def __init__(self, name: str, title: str, explorer: str | None) -> None:
         """Name a weighting.
@@ -176,7 +178,7 @@ class ExactInverseDynamics(Weighting):
 
     name = "exact_inverse_dynamics"
     title = "exact ID"
-    version = 1
+    version = 2
     inputs = ("demonstrations", "reproducibility")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
@@ -210,12 +212,12 @@ class ExactInverseDynamics(Weighting):
 def judged(found: Following, errors: NDArray[np.float64], env_steps: int = 0) -> Transferability:
     """Return scores of (N,) errors by known bounds, and weights in proportion to them.
 
-    No interval is known, so each is all of [0, 1], and every verdict is open.
+    A score is exact as far as the method knows. What is followed more closely than the upper bound is kept.
     """
     scores = found.scores(errors)
-    unknown = np.tile((0.0, 1.0), (len(scores), 1))
-    weights, clusters = kept_weights(scores, unknown, 1.0), np.full(len(scores), -1, np.int32)
-    return Transferability(scores, weights, clusters, unknown, threshold=1.0, env_steps=env_steps)
+    exact = np.stack((scores, scores), axis=1)
+    weights, clusters = kept_weights(scores, exact, ABOVE_NOTHING), np.full(len(scores), -1, np.int32)
+    return Transferability(scores, weights, clusters, exact, ABOVE_NOTHING, env_steps=env_steps)
 
 
 def _errors(found: Reproducibility) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import GailConfig, RunConfig
+from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import environment_spec
 from oodil.pipeline.evaluation import distance_of, evaluate
 from oodil.pipeline.results import LearningCurve, Policy, Training, Trainings, discriminator_file, value_file
@@ -72,10 +73,14 @@ class PolicyStage(Stage):
         """Return the environment steps of all trainings."""
         return sum(training.env_steps for training in Trainings.load(run.artifact(self.name)).trainings)
 
+    def demonstrations(self, run: Run) -> Demonstrations:
+        """Return what it learns from."""
+        return load_demonstrations(run)
+
     def weights(self, run: Run) -> NDArray[np.float64]:
         """Return (N,) weights of the demonstrations."""
         if self.weighting is None:
-            return np.ones(len(load_demonstrations(run)))
+            return np.ones(len(self.demonstrations(run)))
         weighting = stage_named(self.weighting)
         assert isinstance(weighting, Weighting)
         return weighting.load(run).weights
@@ -90,7 +95,7 @@ class PolicyStage(Stage):
         spec = environment_spec(environment.id, environment.dynamics)
         # The same seeds for all policies: they differ in their weights alone.
         seed = torch_seed(derive_key(config.seed, "imitation", job))
-        demonstrations, weights = load_demonstrations(run), self.weights(run)
+        demonstrations, weights = self.demonstrations(run), self.weights(run)
         learner = imitator(
             spec.observation_dim, spec.action_dim, spec.max_episode_steps, demonstrations, weights, gail, seed
         )

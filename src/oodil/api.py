@@ -160,6 +160,7 @@ def finetuning(
     }
     values["finetuning"] |= {"run": str(results.path.absolute()), "weighting": name}
     config = load_config(values, overrides)
+    check_inputs(config)
     path = results.path.absolute()
     return config, path.with_name(f"{path.name}-finetuned-{file.stem}-{name}")
 

@@ -1,6 +1,7 @@
 """``oodil finetune``: a run's policy goes on with later demonstrations, with the same bits whatever happens."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,55 @@ def test_it_learns_from_old_and_new_demonstrations_by_frozen_scores(
     np.testing.assert_allclose(found.weights[:7][kept] / found.weights[:7].sum(), known.weights[kept])
     other = oodil.score(tuned, file).found["later_scores"]
     np.testing.assert_array_equal(other.scores, found.scores[7:])
+
+
+def test_marks_of_the_run_say_how_well_the_frozen_scores_tell_all_sources_apart(tuned: oodil.RunResults) -> None:
+    marks = [True] * 3 + [False] * 4 + [True, False, False]
+    found, known = tuned.weighting("later_scores"), tuned.marks()
+    assert known is not None and known.tolist() == marks
+    steps = tuned.demonstrations.lengths - 1
+    mass = found.weights * steps / (found.weights * steps).sum()
+    scores = np.nan_to_num(found.scores)
+    ranks = [(a > b) + 0.5 * (a == b) for a in scores[known] for b in scores[~known]]
+    figures = tuned.summary()["weightings"]["later_scores"]
+    assert figures["share_before"] == pytest.approx(steps[known].sum() / steps.sum())
+    assert figures["share"] == pytest.approx(mass[known].sum())
+    assert figures["auroc"] == pytest.approx(np.mean(ranks))
+    shown = CliRunner().invoke(app, ["status", str(tuned.path)]).output
+    assert f"AUROC, frozen weighting: {figures['auroc']:.3f}" in shown
+    assert f"frozen weighting: {figures['share_before']:.3f} -> {figures['share']:.3f}" in shown
+
+
+def test_sources_that_the_run_does_not_know_are_marked_in_the_command(
+    base: oodil.RunResults, file: Path, tmp_path: Path
+) -> None:
+    from oodil.api import finetuning
+
+    later = replace(oodil.open_run(base.path).demonstrations, source_labels=("unheard of", "slow"))
+    other = tmp_path / "other.safetensors"
+    write_file(other, encode_demonstrations(later, "oodil/Hopper-v0"))
+
+    def separation(*overrides: str) -> dict[str, float]:
+        config, _ = finetuning(base, other, [*SMALL, *overrides], weighting="distance")
+        return oodil.run(config, workers=0, run_dir=tmp_path / "run", until="later_scores").separation("later_scores")
+
+    assert separation() == {}
+    found = separation("demonstrations.marks={unheard of: true}")
+    # Twice the same demonstrations: all that is told of them stays as it was.
+    assert found["auroc"] == pytest.approx(base.separation("distance")["auroc"])
+    assert found["share"] == pytest.approx(base.separation("distance")["share"])
+
+
+def test_marks_of_a_file_serve_an_ordinary_run_and_its_oracle(file: Path, tmp_path: Path) -> None:
+    overrides = ["demonstrations.sources=[]", f"demonstrations.file={file}", "baselines=[oracle]"]
+    marked = [*overrides, "demonstrations.marks={fast: true, slow: false}"]
+    found = oodil.run(MICRO, marked, workers=0, run_dir=tmp_path / "run", until="marks")
+    marks = found.marks()
+    assert marks is not None and marks.tolist() == [True, False, False]
+    assert found.weighting("marks").weights.tolist() == [1.0, 0.0, 0.0]
+    assert found.separation("marks")["auroc"] == 1
+    with pytest.raises(oodil.OodilError, match="the oracle needs sources that are marked"):
+        oodil.load_config(MICRO, overrides)
 
 
 def test_it_begins_with_the_policy_of_the_run(base: oodil.RunResults, tuned: oodil.RunResults) -> None:
@@ -146,6 +196,9 @@ def test_bad_input_starts_nothing(base: oodil.RunResults, file: Path, tuned: ood
     other = tmp_path / "walker.safetensors"
     write_file(other, encode_demonstrations(base.demonstrations, "oodil/Walker2d-v0"))
     assert "recorded in oodil/Walker2d-v0" in refused(base.path, other)
+    assert f"no source 'quick' in {file}; it has 'fast', 'slow'" in refused(
+        base.path, file, "demonstrations.marks={quick: true}"
+    )
     assert "initial_std is 0.05; it must reach" in refused(base.path, file, "finetuning.initial_std=0.05")
     assert "policy_hidden is [8]; the policy that is continued has [64, 64]" in refused(
         base.path, file, "imitation.gail.policy_hidden=[8]"

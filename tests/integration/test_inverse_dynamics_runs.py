@@ -99,6 +99,17 @@ def test_exact_scores_fall_from_what_can_be_followed_to_the_farthest(run_dir: Pa
 
 
 @pytest.mark.parametrize("name", WEIGHTINGS)
+def test_verdicts_say_what_stays_below_the_upper_bound(run_dir: Path, name: str) -> None:
+    results = oodil.open_run(run_dir)
+    found, kept = results.weighting(name), Following.load(results.artifact(name))
+    followed = kept.errors < kept.highest
+    assert followed.any() and not followed.all()
+    assert found.verdicts.tolist() == ["kept" if each else "not kept" for each in followed]
+    np.testing.assert_array_equal(found.weights > 0, followed)
+    np.testing.assert_allclose(found.weights, found.scores / found.scores.sum())
+
+
+@pytest.mark.parametrize("name", WEIGHTINGS)
 def test_later_demonstrations_are_scored_without_training(run_dir: Path, name: str) -> None:
     results = oodil.open_run(run_dir)
     demonstrations, held = results.demonstrations, results.weighting(name)

@@ -195,6 +195,11 @@ def test_a_value_of_any_type_is_taken_or_refused(key):
         ({"demonstrations": {}}, "demonstrations: give either file or sources"),
         ({"demonstrations": {"file": "a", "sources": [SOURCE]}}, "demonstrations: give either file or sources"),
         ({"demonstrations": {"sources": [SOURCE, SOURCE]}}, "two sources have the same label"),
+        (
+            {"demonstrations": {"sources": [SOURCE], "marks": {"a": True}}},
+            "demonstrations: marks are of the sources in a",
+        ),
+        ({"baselines": ["oracle_target"]}, "learns from an expert of the imitator's own dynamics; name one"),
         ({"baselines": ["oracle"]}, "the oracle needs sources that are marked transferable"),
         ({"baselines": ["bc"]}, "config: baselines: no policy 'bc'; there are imitation, naive_gail, oracle"),
         ({"runtime": {"workers": -1}}, "runtime.workers: .*greater than or equal to 0, got -1"),

@@ -94,6 +94,7 @@ def test_scores_fall_linearly_between_the_bounds() -> None:
     found = Following(errors, 0.2, 0.6)
     np.testing.assert_allclose(found.scores(errors), [1, 1, 0.75, 0.25, 0], atol=1e-12)
     np.testing.assert_allclose(judged(found, errors).weights, np.array([1, 1, 0.75, 0.25, 0]) / 3)
+    assert judged(found, errors).verdicts.tolist() == ["kept"] * 4 + ["not kept"]
     assert error_bounds(errors + 0.6, held_out) == (0.2, 9.6), "all are above, so the worst of them is the bound"
 
 
@@ -101,7 +102,7 @@ def test_where_nothing_or_everything_scores_zero_no_one_is_preferred() -> None:
     found = Following(np.array([2.0, np.inf]), 1.0, 1.0)
     assert found.scores(np.array([1.0, 1.0 + 1e-9])).tolist() == [1, 0]
     assert judged(found, found.errors).weights.tolist() == [0.5, 0.5]
-    assert set(judged(found, found.errors).verdicts) == {"open"}, "no interval is known"
+    assert set(judged(found, found.errors).verdicts) == {"not kept"}, "both are beyond the bound"
 
 
 def test_what_was_found_reads_back(tmp_path: Path, assert_same_bits: Any) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.results import Transferability
+from oodil.pipeline.runs import separation_metrics
 from oodil.pipeline.verdicts import LITTLE, VerdictTable
 
 
@@ -53,6 +54,16 @@ def test_nothing_is_reproduced_well_if_the_best_cluster_is_not() -> None:
     without = replace(poor, clusters=np.full(4, -1, np.int32))
     assert VerdictTable.of(without, held).warning == ""
     assert VerdictTable.of(without, held).by_cluster == ()
+
+
+def test_what_has_no_score_ranks_last_among_marks() -> None:
+    found, held = four()
+    scores = np.array([0.4, 0.3, np.nan, 0.1])
+    told = separation_metrics(np.array([True, False, False, True]), scores, found.weights, held)
+    assert told["auroc"] == pytest.approx(3 / 4)  # 0.4 is above 0.3 and 0; 0.1 is above 0
+    assert told["share_before"] == pytest.approx(8 / 10)
+    assert told["share"] == pytest.approx(6 / 7)
+    assert told["share_power_1"] == pytest.approx((0.4 * 6 + 0.1 * 2) / (0.4 * 6 + 0.3 + 0.1 * 2))
 
 
 def test_a_table_is_json() -> None:
