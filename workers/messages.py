@@ -25,14 +25,14 @@ from oodil.workers.wire import (
     count,
     items,
     key,
-    numbers_by_name,
     pack,
     read,
     text,
     unpack,
+    values_by_name,
 )
 
-SCHEMA = 3
+SCHEMA = 4
 """Raise it when the meaning of a message changes; other versions are refused."""
 MAX_FRAMES = 64
 MAX_FRAME_BYTES = 256 * 1024 * 1024
@@ -108,7 +108,7 @@ _UNIT: Readers = {
     "iteration": count,
     "group": count,
     "env_id": text,
-    "dynamics": numbers_by_name,
+    "dynamics": values_by_name,
     "num_simulators": count,
     "num_steps": count,
     "policy_version": count,
