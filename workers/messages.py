@@ -23,6 +23,7 @@ from oodil.workers.wire import (
     Readers,
     brief,
     count,
+    flag,
     items,
     key,
     pack,
@@ -98,6 +99,8 @@ class UnitFailure:
     iteration: int
     group: int
     traceback: str
+    is_final: bool = False
+    """Whether nobody should try again: the environment cannot be used, and instead of a traceback it is said why."""
 
 
 Message = Ready | Refused | UnitMessage | ResultMessage | UnitFailure
@@ -119,7 +122,7 @@ _FIELDS: dict[str, Readers] = {
     "Refused": {"reason": text},
     "UnitMessage": _UNIT,
     "ResultMessage": {"iteration": count, "group": count, "policy_version": count},
-    "UnitFailure": {"iteration": count, "group": count, "traceback": text},
+    "UnitFailure": {"iteration": count, "group": count, "traceback": text, "is_final": flag},
 }
 Arrays = dict[str, NDArray]
 

@@ -48,6 +48,13 @@ def text(value: Any) -> str:
     return value
 
 
+def flag(value: Any) -> bool:
+    """Read a truth value."""
+    if type(value) is not bool:
+        raise MessageError(f"expected a truth value, found {brief(value)}")
+    return value
+
+
 def key(value: Any) -> tuple[int, ...]:
     """Read a random key."""
     return tuple(count(part) for part in items(value))

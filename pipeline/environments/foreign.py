@@ -100,6 +100,8 @@ class ForeignEnvironment:
         self.elapsed = 0
         self.env_return = 0.0
         self.terminated, self.truncated = False, True
+        self._is_sound = False
+        """Whether it stands where the history ends; not so after an exception in the middle of a step."""
 
     def reset(self, seed: int) -> None:
         """Start a new episode with a seed of at most 2**53."""
@@ -121,7 +123,7 @@ class ForeignEnvironment:
 
     def step(self, action: NDArray[np.float32]) -> float:
         """Apply an action (A,), in units of the action space and clipped to it, and return the reward."""
-        number = self.elapsed + 1
+        number, self._is_sound = self.elapsed + 1, False
         try:
             outcome = self._env.step(self._applied(action))
         except Exception as error:
@@ -143,7 +145,7 @@ class ForeignEnvironment:
         self.terminated, self.truncated = bool(terminated), bool(truncated)
         self._row[begin : begin + self.action_dim] = action
         self._row[begin + self.action_dim] = _mark(self.observation, gained, self.terminated, self.truncated)
-        self.elapsed = number
+        self.elapsed, self._is_sound = number, True
         self.env_return += gained
         return gained
 
@@ -154,7 +156,7 @@ class ForeignEnvironment:
     def stands_at(self, history: NDArray[np.float64], elapsed: int) -> bool:
         """Return whether a history of some steps is that of the present episode; it may be longer."""
         own = self.history()
-        return elapsed == self.elapsed and history[: len(own)].tobytes() == own.tobytes()
+        return self._is_sound and elapsed == self.elapsed and history[: len(own)].tobytes() == own.tobytes()
 
     def replay(self, history: NDArray[np.float64], elapsed: int) -> None:
         """Play an episode again. Raises UnusableEnvironmentError, with the step, if it differs from what was seen."""
@@ -185,6 +187,7 @@ class ForeignEnvironment:
             )
 
     def _reset(self, seed: int) -> NDArray[np.float64]:
+        self._is_sound = False
         try:
             outcome = self._env.reset(seed=seed)
         except Exception as error:
@@ -197,7 +200,7 @@ class ForeignEnvironment:
     def _begin(self, seen: NDArray[np.float64], seed: int) -> None:
         self.observation = seen
         self._row[0], self._row[1] = seed, _mark(seen, 0.0, False, False)
-        self.elapsed, self.env_return = 0, 0.0
+        self.elapsed, self.env_return, self._is_sound = 0, 0.0, True
         self.terminated = self.truncated = False
 
     def _applied(self, action: NDArray[np.float32]) -> NDArray[Any]:
