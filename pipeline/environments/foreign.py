@@ -141,7 +141,7 @@ class ForeignEnvironment:
             ) from error
         begin = self._before_steps + self.elapsed * (self.action_dim + 1)
         if begin == len(self._row):
-            self._row = np.concatenate((self._row, np.zeros(begin)))
+            self._row = np.concatenate((self._row, np.zeros(begin - self._before_steps)))
         self.terminated, self.truncated = bool(terminated), bool(truncated)
         self._row[begin : begin + self.action_dim] = action
         self._row[begin + self.action_dim] = _mark(self.observation, gained, self.terminated, self.truncated)

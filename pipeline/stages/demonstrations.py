@@ -126,7 +126,7 @@ def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
             raise DataError(f"{section.file}: recorded in {environment}, but the run is for {config.environment.id}")
     if count < config.clustering.num_clusters and config.finetuning.run is None:
         raise DataError(
-            f"{section.file or 'demonstrations.sources'}: {count} demonstrations cannot make "
+            f"{section.file or 'demonstrations.sources'}: {count} demonstration{'s' * (count > 1)} cannot make "
             f"{config.clustering.num_clusters} clusters; set clustering.num_clusters to {count} or less, or give more"
         )
     for source in section.sources:
