@@ -134,10 +134,9 @@ def _why_unmade(env_id: str, error: Exception) -> str:
     """Return what went wrong when an environment was made, and what to do about it where that is known."""
     said = str(error) if isinstance(error, gymnasium.error.Error) else f"{type(error).__name__}: {error}"
     if isinstance(error, ModuleNotFoundError):
-        module = env_id.partition(":")[0]
-        hint = (
-            f"; {module}.py has to lie beside the configuration file, or on PYTHONPATH" if error.name == module else ""
-        )
+        module = env_id.partition(":")[0].partition(".")[0]
+        is_own = f"No module named '{module}'" in said
+        hint = f"; {module} has to lie beside the configuration file, or on PYTHONPATH" if is_own else ""
     elif isinstance(error, ImportError) and (newer := _newest(env_id)):
         hint = f"; there is {newer}"
     elif isinstance(error, FileNotFoundError) and error.filename and not os.path.isabs(error.filename):

@@ -133,12 +133,10 @@ class ForeignEnvironment:
             raise UnusableEnvironmentError(f"{self._at(number)}: step returned {_kind(outcome)}{_OLD_INTERFACE}")
         seen, reward, terminated, truncated, _ = outcome
         self.observation = self._checked(seen, number)
-        try:
-            gained = float(np.asarray(reward, np.float64).reshape(()))
-        except (TypeError, ValueError) as error:
-            raise UnusableEnvironmentError(
-                f"{self._at(number)}: the reward is {reward!r}, which is no number"
-            ) from error
+        paid = np.asarray(reward)
+        if paid.size != 1 or paid.dtype.kind not in "biuf":
+            raise UnusableEnvironmentError(f"{self._at(number)}: the reward is {reward!r}, which is no number")
+        gained = float(paid.item())
         begin = self._before_steps + self.elapsed * (self.action_dim + 1)
         if begin == len(self._row):
             self._row = np.concatenate((self._row, np.zeros(begin - self._before_steps)))
