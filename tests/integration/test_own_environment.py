@@ -1,4 +1,4 @@
-"""An environment in a file beside the configuration, through every kind of process; and what is refused at the start."""
+"""An environment in a file beside the configuration, through every kind of process, and what is refused at once."""
 
 import os
 import subprocess
