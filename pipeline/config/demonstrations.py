@@ -5,7 +5,7 @@ from typing import Literal, Self
 
 from pydantic import Field, PositiveInt, model_validator
 
-from oodil.pipeline.config.sections import Section, UnitInterval
+from oodil.pipeline.config.sections import Dynamics, Section, UnitInterval
 
 
 class ExpertConfig(Section):
@@ -31,8 +31,8 @@ class SourceConfig(ExpertConfig):
 
     label: str
     """Its name in reports."""
-    dynamics: dict[str, float] = Field(default={})
-    """Keyword arguments of the environment: the demonstrator's own dynamics."""
+    dynamics: Dynamics = Field(default={})
+    """Keyword arguments of the environment: the demonstrator's own dynamics; see `environment.dynamics`."""
     expert_discount: UnitInterval = 0.995
     """Discount with which its expert is trained; flights are long under low gravity and want a longer horizon."""
     transferable: bool | None = None
