@@ -4,7 +4,7 @@ import hashlib
 from dataclasses import replace
 from typing import Any
 
-from oodil.pipeline.artifacts import Files
+from oodil.pipeline.artifacts import Files, read_artifact
 from oodil.pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.datasets import read_demonstrations, read_file
@@ -14,7 +14,7 @@ from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.policy import Controller, GaussianPolicy
 from oodil.pipeline.results import CollectedDemonstrations
 from oodil.pipeline.seeding import derive_key, numpy_rng
-from oodil.pipeline.stage import JobContext, Run, Stage, base_run, register
+from oodil.pipeline.stage import JobContext, Run, Stage, base_run, register, state_of
 from oodil.pipeline.stages.experts import load_expert, transfer_returns
 
 COLLECTION_SIMULATORS = 16
@@ -45,6 +45,20 @@ class DemonstrationsStage(Stage):
         ]
         flags = section.model_dump(include={"deterministic", "full_length_only", "minimum_return"})
         return common | flags | {"sources": sources, "imitator": config.environment.dynamics}
+
+    def origin(self, run: Run) -> dict[str, Any]:
+        """Return what names the artifact.
+
+        A finished one is a copy: once its file or an expert is gone, or the run is on another machine, what their
+        content was is taken from there.
+        """
+        try:
+            return super().origin(run)
+        except (DataError, ExpertError):
+            held = read_artifact(run.directory.stage(self.name))
+            if held is None:
+                raise
+            return held.origin | {"version": self.version, "seed": run.config.seed}
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the settings without the imitator's dynamics, in which `combine` alone runs experts."""
@@ -96,18 +110,31 @@ class DemonstrationsStage(Stage):
 def load_demonstrations(run: Run) -> Demonstrations:
     """Return the demonstrations of a run whose first stage is finished, under the labels of its configuration."""
     held = CollectedDemonstrations.load(run.artifact(DemonstrationsStage.name)).demonstrations
-    labels = tuple(source.label for source in run.config.demonstrations.sources)
-    return replace(held, source_labels=labels) if labels else held
+    section = run.config.demonstrations
+    labels = tuple(source.label for source in section.sources) or section.labels
+    # A run that is continued comes first, with labels of its own.
+    earlier = held.source_labels[: len(held.source_labels) - len(labels)]
+    return replace(held, source_labels=earlier + labels) if labels else held
 
 
-def transferable_marks(config: RunConfig) -> list[bool | None]:
-    """Return whether each source is marked transferable, by source; empty for demonstrations from a file."""
-    return [source.transferable for source in config.demonstrations.sources]
-
-
-def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
-    """Raise DataError or ExpertError, before any work, if the demonstrations cannot fit the environment."""
+def transferable_marks(config: RunConfig, labels: tuple[str, ...]) -> list[bool | None]:
+    """Return whether each source, by its label, is marked transferable; None where nothing is said of it."""
     section = config.demonstrations
+    if section.sources:
+        return [source.transferable for source in section.sources]
+    if not section.transferable:
+        return [None] * len(labels)
+    return [None if label in section.unmarked else label in section.transferable for label in labels]
+
+
+def check_demonstrations(config: RunConfig, observation_dim: int, run: Run | None = None) -> None:
+    """Raise DataError or ExpertError, before any work, if the demonstrations cannot fit the environment.
+
+    A ``run`` that has taken them over needs neither their file nor their experts any more.
+    """
+    section = config.demonstrations
+    if run is not None and state_of(DemonstrationsStage(), run).state == "done":
+        return
     if section.file is not None:
         demonstrations, environment = read_demonstrations(section.file)
         if demonstrations.observation_dim != observation_dim:
@@ -115,8 +142,10 @@ def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
                 f"{section.file}: states have {demonstrations.observation_dim} dimensions; "
                 f"environment {config.environment.id} has {observation_dim}"
             )
-        if environment and environment != config.environment.id:
+        # The module that registers an environment is no part of its name.
+        if environment and environment.rpartition(":")[2] != config.environment.id.rpartition(":")[2]:
             raise DataError(f"{section.file}: recorded in {environment}, but the run is for {config.environment.id}")
+        _check_labels(config, demonstrations)
     for source in section.sources:
         if source.expert_folder is None:
             hand_written(make_batch(config.environment.id, source.dynamics, 1), config.environment.id)
@@ -127,6 +156,19 @@ def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
                 f"{source.expert}: the expert sees {len(policy.input_mean)} dimensions; "
                 f"environment {config.environment.id} has {observation_dim}"
             )
+
+
+def _check_labels(config: RunConfig, demonstrations: Demonstrations) -> None:
+    """Raise DataError for labels and marks that are not those of the file's sources."""
+    section, held = config.demonstrations, demonstrations.source_labels
+    if section.labels and len(section.labels) != len(held):
+        raise DataError(
+            f"{section.file}: has {len(held)} sources ({', '.join(held)}), but there are {len(section.labels)} labels"
+        )
+    known = section.labels or held
+    for label in (*section.transferable, *section.unmarked):
+        if label not in known:
+            raise DataError(f"{section.file}: has no source {label!r}, only {', '.join(known)}")
 
 
 def hand_written(simulators: Simulators, env_id: str) -> Controller:

@@ -24,17 +24,19 @@ class MarksWeighting(Weighting):
 
     def check(self, config: RunConfig) -> None:
         """Raise ConfigError unless some source is marked transferable."""
-        if True not in transferable_marks(config):
+        section = config.demonstrations
+        if not section.transferable and True not in transferable_marks(config, ()):
             raise ConfigError("baselines: the oracle needs sources that are marked transferable: true")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the marks."""
-        return {"transferable": transferable_marks(config)}
+        return {"transferable": list(config.demonstrations.transferable) or transferable_marks(config, ())}
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Look the marks up; what is not marked counts as not transferable."""
         demonstrations = load_demonstrations(run)
-        marks = np.array([float(mark is True) for mark in transferable_marks(run.config)])
+        known = transferable_marks(run.config, demonstrations.source_labels)
+        marks = np.array([float(mark is True) for mark in known])
         scores = marks[demonstrations.sources]
         intervals = np.stack((scores, scores), axis=1)
         clusters = np.full(len(scores), -1, np.int32)
