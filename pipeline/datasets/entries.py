@@ -86,7 +86,7 @@ def _in_order(tree: Any) -> bool:
 
 
 def _listed(tree: Any) -> str:
-    found = sorted(leaves(tree))
+    found = sorted(leaves(tree)) or ["nothing"]
     return ", ".join(found[:20]) + (f" and {len(found) - 20} more" if len(found) > 20 else "")
 
 

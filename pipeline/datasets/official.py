@@ -45,7 +45,8 @@ _NUMPY = {
 
 class _ArraysOnly(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        own = module.replace("numpy.core.", "numpy._core.")  # As it was called before NumPy 2.
+        # As they were called before NumPy 2 and Python 3.
+        own = module.replace("numpy.core.", "numpy._core.").replace("__builtin__", "builtins")
         if (own, name) in _PLAIN:
             return _PLAIN[own, name]
         if (own, name) in _NUMPY:

@@ -2,6 +2,7 @@
 
 import hashlib
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from oodil.pipeline.artifacts import Files, read_artifact
@@ -134,9 +135,11 @@ def check_demonstrations(config: RunConfig, observation_dim: int, run: Run | Non
     """
     section = config.demonstrations
     if run is not None and state_of(DemonstrationsStage(), run).state == "done":
+        _check_count(config, len(load_demonstrations(run)), run.directory.path)
         return
     if section.file is not None:
         demonstrations, environment = read_demonstrations(section.file)
+        _check_count(config, len(demonstrations), section.file)
         if demonstrations.observation_dim != observation_dim:
             raise DataError(
                 f"{section.file}: states have {demonstrations.observation_dim} dimensions; "
@@ -146,6 +149,8 @@ def check_demonstrations(config: RunConfig, observation_dim: int, run: Run | Non
         if environment and environment.rpartition(":")[2] != config.environment.id.rpartition(":")[2]:
             raise DataError(f"{section.file}: recorded in {environment}, but the run is for {config.environment.id}")
         _check_labels(config, demonstrations)
+    else:
+        _check_count(config, sum(source.count for source in section.sources), "demonstrations.sources")
     for source in section.sources:
         if source.expert_folder is None:
             hand_written(make_batch(config.environment.id, source.dynamics, 1), config.environment.id)
@@ -156,6 +161,15 @@ def check_demonstrations(config: RunConfig, observation_dim: int, run: Run | Non
                 f"{source.expert}: the expert sees {len(policy.input_mean)} dimensions; "
                 f"environment {config.environment.id} has {observation_dim}"
             )
+
+
+def _check_count(config: RunConfig, count: int, origin: str | Path) -> None:
+    """Raise DataError when there are fewer demonstrations than clusters; a run that is continued has its clusters."""
+    if config.finetuning.run is None and count < config.clustering.num_clusters:
+        raise DataError(
+            f"{origin}: {count} demonstrations cannot form {config.clustering.num_clusters} clusters; give more, or a "
+            "smaller clustering.num_clusters"
+        )
 
 
 def _check_labels(config: RunConfig, demonstrations: Demonstrations) -> None:
