@@ -1,6 +1,7 @@
 """Recordings as they are, with the real libraries: what is read of them, what is refused, and what goes back."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -223,7 +224,7 @@ def test_a_folder_of_lerobot(tmp_path: Path) -> None:
     assert found.returns.tolist() == list(LENGTHS)
     pyarrow.parquet.write_table(table.take(np.random.default_rng(0).permutation(len(STATES))), tmp_path / "a.parquet")
     assert_each(read(tmp_path / "a.parquet", "observation.state"))
-    with pytest.raises(DataError, match="choose with --keys|no entry 'observation.pose'"):
+    with pytest.raises(DataError, match=r"has no entry 'observation\.pose'"):
         read(tmp_path / "set", "observation.pose")
     with pytest.raises(DataError, match=r"is a folder, and none of LeRobot's"):
         read(tmp_path)
@@ -321,18 +322,10 @@ def test_a_run_goes_on_without_its_file_and_elsewhere(file_run: tuple[Path, Path
     file.unlink()
     moved = (tmp_path / "run").rename(tmp_path / "moved")
     assert oodil.open_run(moved).is_done("demonstrations")
+    arguments = ["resume", str(moved), "--until", "clustering", "--workers", "1"]
     ended = subprocess.run(
-        [
-            sys.executable,
-            str(ROOT / "orchestrator.py"),
-            "resume",
-            str(moved),
-            "--until",
-            "clustering",
-            "--workers",
-            "1",
-        ],
-        env={"HOME": "/nowhere", "PATH": "/usr/bin:/bin"},
+        [sys.executable, str(ROOT / "orchestrator.py"), *arguments],
+        env=os.environ | {"HOME": "/nowhere"},
         capture_output=True,
         text=True,
     )
