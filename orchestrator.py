@@ -115,12 +115,15 @@ def refuse_to_replace(run: Run, force: Collection[str]) -> None:
                 )
 
 
-def check_inputs(config: RunConfig) -> None:
-    """Refuse, before any work, an environment that cannot be made and demonstrations that cannot fit it."""
+def check_inputs(config: RunConfig, run: Run | None = None) -> None:
+    """Refuse, before any work, an environment that cannot be made and demonstrations that cannot fit it.
+
+    A ``run`` that has taken over its demonstrations is not asked for what they are from.
+    """
     spec = check_environment(config.environment.id, config.environment.dynamics)
     for source in config.demonstrations.sources:
         check_environment(config.environment.id, source.dynamics)
-    check_demonstrations(config, spec.observation_dim)
+    check_demonstrations(config, spec.observation_dim, run)
     if TargetDemonstrationsStage.name in [stage.name for stage in stages(config)]:
         check_target(config, spec.observation_dim)
 

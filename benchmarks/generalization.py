@@ -108,13 +108,13 @@ def main() -> None:
         print(name, {key: round(line[key], 3) for key in ("auroc", "share_before", "share")}, flush=True)
     save(arguments.json, figures)
 
-    marks = ", ".join(f"{source.label}: {str(source.transferable is True).lower()}" for source in sources[KNOWN:])
+    marks = ", ".join(source.label for source in sources[KNOWN:] if source.transferable)
     figures["finetuned"] = {}
     for name in scored.found:
         tuned = oodil.finetune(
             base,
             file,
-            [f"demonstrations.marks={{{marks}}}"],
+            [f"demonstrations.transferable=[{marks}]"],
             weighting=name,
             workers=workers,
             run_dir=folder / f"finetuned-{name}",

@@ -50,6 +50,8 @@ class Demonstrations:
     """(N,) true returns in the demonstrator's own environment, NaN where unknown; for reporting only."""
     terminated: NDArray[np.bool_]
     """(N,) whether it ended because the demonstrator failed, as opposed to a time limit or the end of a recording."""
+    source_keys: tuple[tuple[str, ...], ...] = ()
+    """By source, which entries of its recording make up a state, for exporting to it; empty where nothing is known."""
 
     def __post_init__(self) -> None:
         if self.observations.ndim != 2 or self.observations.dtype != np.float32 or not self.observations.shape[1]:
@@ -78,8 +80,11 @@ class Demonstrations:
             raise DataError(f"source indices must lie in [0, {len(self.source_labels)})")
 
     @classmethod
-    def of(cls, episodes: list[Episode], label: str) -> "Demonstrations":
-        """Return the states of the episodes of one source. Raises DataError when one does not fit the others."""
+    def of(cls, episodes: list[Episode], label: str, keys: tuple[str, ...] = ()) -> "Demonstrations":
+        """Return the states of the episodes of one source, of these keys of its recording.
+
+        Raises DataError when an episode does not fit the others.
+        """
         if not episodes:
             raise DataError("there is no demonstration")
         dim = episodes[0].states.shape[-1] if episodes[0].states.ndim == 2 else 0
@@ -97,6 +102,7 @@ class Demonstrations:
             source_labels=(label,),
             returns=np.array([episode.env_return for episode in episodes]),
             terminated=np.array([episode.terminated for episode in episodes]),
+            source_keys=(keys,) if keys else (),
         )
 
     @classmethod
@@ -119,6 +125,7 @@ class Demonstrations:
             source_labels=tuple(label for part in parts for label in part.source_labels),
             returns=np.concatenate([part.returns for part in parts]),
             terminated=np.concatenate([part.terminated for part in parts]),
+            source_keys=tuple(keys for part in parts for keys in part.source_keys or ((),) * len(part.source_labels)),
         )
 
     def __len__(self) -> int:
@@ -156,6 +163,7 @@ class Demonstrations:
             source_labels=self.source_labels,
             returns=self.returns[chosen],
             terminated=self.terminated[chosen],
+            source_keys=self.source_keys,
         )
 
 

@@ -171,21 +171,26 @@ class RunResults:
 
     def marks(self) -> NDArray[np.bool_] | None:
         """Return (N,) whether each demonstration's source is marked transferable; None unless all are marked."""
-        known, demonstrations = transferable_marks(self.config), self.demonstrations
-        marks = [known.get(label) for label in demonstrations.source_labels]
-        return None if None in marks else np.array(marks, np.bool_)[demonstrations.sources]
+        marks = transferable_marks(self.config, self.demonstrations.source_labels)
+        if None in marks:
+            return None
+        return np.array(marks, np.bool_)[self.demonstrations.sources]
 
     def separation(self, weighting: str = "transferability") -> dict[str, float]:
         """Return how well a weighting tells what is marked transferable from what is marked not to be.
 
         ``auroc`` of the scores, and the former's share of the sampling mass: ``share_before`` weighting, ``share`` with
         the weights, and ``share_power_1``, 2, 4 and 8 with that power of the scores instead; ``effective_number`` of
-        those that are marked transferable. Empty without marks of both kinds.
+        those that are marked transferable. Empty without marks of both kinds. Sources without a mark are left out, as
+        if they were not there.
         """
-        marks, found = self.marks(), self.weighting(weighting)
-        if marks is None or not 0 < marks.sum() < len(marks):
+        found, demonstrations = self.weighting(weighting), self.demonstrations
+        by_source = transferable_marks(self.config, demonstrations.source_labels)
+        known = np.flatnonzero(np.array([mark is not None for mark in by_source])[demonstrations.sources])
+        marks = np.array([mark is True for mark in by_source])[demonstrations.sources[known]]
+        if not 0 < marks.sum() < len(marks) or not found.weights[known].any():
             return {}
-        return separation_metrics(marks, found.scores, found.weights, self.demonstrations)
+        return separation_metrics(marks, found.scores[known], found.weights[known], demonstrations.select(known))
 
     def env_steps(self) -> dict[str, int]:
         """Return the environment steps that each finished stage took; stages that take none are left out."""

@@ -44,8 +44,13 @@ class DemonstrationsConfig(Section):
 
     file: Path | None = None
     """A saved set, relative to the configuration file."""
-    marks: dict[str, bool] = Field(default={})
-    """By label, whether the imitator can reproduce a source in the file, if known; as `transferable` of `sources`."""
+    labels: tuple[str, ...] = ()
+    """What the sources of the file are called in reports, in its order; without, as in the file."""
+    transferable: tuple[str, ...] = ()
+    """Sources of the file, by label, that the imitator is known to be able to reproduce, all others not: for the report
+    and the oracle, never an input of the method."""
+    unmarked: tuple[str, ...] = ()
+    """Sources of the file, by label, of which nothing is known; needs ``transferable``."""
     sources: tuple[SourceConfig, ...] = ()
     """Demonstrators to collect from."""
     deterministic: bool = False
@@ -60,8 +65,12 @@ class DemonstrationsConfig(Section):
     def _one_origin(self) -> "DemonstrationsConfig":
         if (self.file is None) == (not self.sources):
             raise ValueError("give either file or sources")
-        if self.marks and self.sources:
-            raise ValueError("marks are of the sources in a file; those listed here have a field `transferable` each")
+        if self.sources and (self.labels or self.transferable or self.unmarked):
+            raise ValueError("labels, transferable and unmarked are for a file; each of the sources has its own")
+        if self.unmarked and (not self.transferable or {*self.unmarked} & {*self.transferable}):
+            raise ValueError("unmarked are other sources than transferable, and need some that are transferable")
+        if len(set(self.labels)) != len(self.labels):
+            raise ValueError(f"two sources have the same label: {list(self.labels)}")
         labels = [source.label for source in self.sources]
         if len(set(labels)) != len(labels):
             raise ValueError(f"two sources have the same label: {labels}")

@@ -1,13 +1,20 @@
 """Minari data sets that are on this machine already; nothing is downloaded. Needs the extra ``oodil[data]``."""
 
+import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from oodil.pipeline.data import Demonstrations, Episode
+from oodil.pipeline.artifacts import write_file
+from oodil.pipeline.data import Episode
+from oodil.pipeline.datasets import layouts
+from oodil.pipeline.datasets.entries import STATES, TERMINATED
 from oodil.pipeline.errors import DataError
+
+_OURS = "oodil_"
+"""How metadata of ours begins; that of an earlier export goes when new comes."""
 
 
 def read(dataset_id: str, keys: tuple[str, ...]) -> tuple[list[Episode], str]:
@@ -21,27 +28,43 @@ def read(dataset_id: str, keys: tuple[str, ...]) -> tuple[list[Episode], str]:
     """
     dataset = _local(dataset_id)
     episodes = []
-    for episode in dataset.iterate_episodes():
+    for n, episode in enumerate(dataset.iterate_episodes()):
+        nested = isinstance(episode.observations, dict | tuple)
         # A terminated episode may have ended in success: whether it is a failure, only its owner knows.
-        states = _states(episode.observations, keys)
-        episodes.append(Episode(states, float(np.sum(episode.rewards)), bool(episode.terminations[-1])))
+        parts = {
+            STATES[0]: episode.observations,
+            "rewards": episode.rewards,
+            TERMINATED[0]: episode.terminations,
+        }
+        episodes.append(layouts.episode(parts, keys if nested else (), f"demonstration {n}"))
     return episodes, dataset.env_spec.id if dataset.env_spec is not None else ""
 
 
-def write_metadata(dataset_id: str, demonstrations: Demonstrations, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Add ``oodil_*`` entries to the metadata of each episode of the data set that the demonstrations came from.
-
-    Raises DataError when it has another number of episodes, or episodes of other lengths.
-    """
+def write_metadata(dataset_id: str, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Add ``oodil_*`` entries to the metadata of the (N,) episodes of a data set; what we added before goes."""
     dataset = _local(dataset_id)
-    lengths = [len(episode) + 1 for episode in dataset.iterate_episodes()]
-    if lengths != demonstrations.lengths.tolist():
-        raise DataError(
-            f"{dataset_id} has {len(lengths)} episodes with {sum(lengths)} states; the run has "
-            f"{len(demonstrations)} with {demonstrations.lengths.sum()}: it was made from other data"
-        )
-    rows = [{f"oodil_{name}": column[n].item() for name, column in columns.items()} for n in range(len(lengths))]
-    dataset.storage.update_episode_metadata(rows, dataset.episode_indices)
+    indices = [int(index) for index in dataset.episode_indices]
+    rows = [{f"{_OURS}{name}": column[n].item() for name, column in columns.items()} for n in range(len(indices))]
+    _forget(dataset.storage, indices)
+    dataset.storage.update_episode_metadata(rows, indices)
+
+
+def _forget(storage: Any, indices: list[int]) -> None:
+    """Remove our metadata, for which Minari has no way of its own."""
+    folder = Path(storage.data_path)
+    if storage.FORMAT == "hdf5":
+        import h5py
+
+        with h5py.File(folder / "main_data.hdf5", "r+") as file:
+            for index in indices:
+                attributes = file[f"episode_{index}"].attrs
+                for old in [name for name in attributes if name.startswith(_OURS)]:
+                    del attributes[old]
+        return
+    for path in (folder / str(index) / "metadata.json" for index in indices):
+        if path.exists():
+            kept = {name: value for name, value in json.loads(path.read_text()).items() if not name.startswith(_OURS)}
+            write_file(path, json.dumps(kept).encode())
 
 
 def _local(dataset_id: str) -> Any:
@@ -51,15 +74,3 @@ def _local(dataset_id: str) -> Any:
         return minari.load_dataset(dataset_id, download=False)
     except (FileNotFoundError, ValueError) as error:
         raise DataError(f"not a local Minari data set ({error})") from error
-
-
-def _states(observations: Any, keys: tuple[str, ...]) -> NDArray[np.floating]:
-    if isinstance(observations, dict):
-        if not keys:
-            raise DataError(f"observations have entries {', '.join(sorted(observations))}; choose with --keys")
-        missing = [key for key in keys if key not in observations]
-        if missing:
-            raise DataError(f"observations have no entry {missing[0]!r}; there are {', '.join(sorted(observations))}")
-        parts = [np.asarray(observations[key]) for key in keys]
-        return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
-    return np.asarray(observations)

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import safetensors
@@ -24,11 +25,13 @@ _DTYPES = {
 def encode_demonstrations(demonstrations: Demonstrations, environment_id: str) -> bytes:
     """Return the file's bytes."""
     arrays = {name: np.ascontiguousarray(getattr(demonstrations, name)) for name in _DTYPES}
-    header = {
+    header: dict[str, Any] = {
         "schema": SCHEMA,
         "environment": environment_id,
         "source_labels": list(demonstrations.source_labels),
     }
+    if any(demonstrations.source_keys):
+        header["source_keys"] = demonstrations.source_keys
     # One entry only: safetensors writes several in no fixed order, and equal sets must be equal files.
     return safetensors.numpy.save(arrays, metadata={_HEADER: json.dumps(header)})
 
@@ -58,7 +61,10 @@ def decode_demonstrations(content: bytes, origin: str) -> tuple[Demonstrations, 
         arrays = safetensors.numpy.load(content)
         header = {"schema": SCHEMA, "environment": "", "source_labels": ["demonstrations"]}
         header |= json.loads(metadata.get(_HEADER, "{}"))
+        keys = tuple(tuple(each) for each in header.get("source_keys", ()))
     except (safetensors.SafetensorError, ValueError, AttributeError, TypeError) as error:
+        if not origin.endswith(".safetensors"):
+            raise DataError(f"{origin}: is no file of ours; oodil demos convert makes one of it") from error
         raise DataError(f"{origin}: not a sound safetensors file, truncated perhaps ({error})") from error
     if header["schema"] != SCHEMA:
         raise DataError(f"{origin}: schema {header['schema']}; this version reads schema {SCHEMA}")
@@ -74,7 +80,7 @@ def decode_demonstrations(content: bytes, origin: str) -> tuple[Demonstrations, 
             raise DataError(f"{origin}: array {name!r} is {arrays[name].dtype}; expected {np.dtype(dtype)}")
     try:
         parts = {name: arrays[name] for name in _DTYPES}
-        demonstrations = Demonstrations(source_labels=tuple(header["source_labels"]), **parts)
+        demonstrations = Demonstrations(source_labels=tuple(header["source_labels"]), source_keys=keys, **parts)
     except DataError as error:
         raise DataError(f"{origin}: {error}") from error
     return demonstrations, str(header["environment"])

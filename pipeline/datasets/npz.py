@@ -1,47 +1,55 @@
-"""NumPy archives: our own two arrays, one array per demonstration, or the trajectories of the `imitation` library."""
+"""NumPy archives; which of their arrays are demonstrations, `oodil.pipeline.datasets.layouts` knows."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodil.pipeline.data import Demonstrations, Episode
+from oodil.pipeline.datasets import layouts, official
+from oodil.pipeline.datasets.columns import Warn
 from oodil.pipeline.errors import DataError
 
 
-def read(path: Path) -> list[Episode]:
-    """Return the episodes of an archive. It holds one of these:
+class _Archive(Mapping[str, Any]):
+    """The arrays of an archive, each read when it is asked for, once; objects by the restricted reader."""
 
-    * ``observations`` (sum T, S) and ``offsets`` (N + 1),
-    * ``obs`` (sum T, S) and ``indices`` (N - 1), as saved by `imitation`, with ``rews`` and ``terminal`` if there,
-    * any number of (T, S) arrays, taken in the order in which they were saved.
+    def __init__(self, archive: np.lib.npyio.NpzFile, zipped: ZipFile) -> None:
+        self.archive, self.zipped = archive, zipped
+        self.found: dict[str, NDArray[Any]] = {}
 
-    Raises DataError. Objects, which would have to be unpickled, are not touched.
-    """
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in self.found:
+            try:
+                self.found[name] = self.archive[name]
+            except ValueError as error:
+                if "Object arrays" not in str(error):
+                    raise
+                with self.zipped.open(f"{name}.npy") as file:
+                    self.found[name] = official.read_objects(file)
+        return self.found[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.archive.files
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.archive.files)
+
+    def __len__(self) -> int:
+        return len(self.archive.files)
+
+
+def read(path: Path, keys: tuple[str, ...], warn: Warn) -> list[Episode]:
+    """Return the episodes of an archive. Raises DataError."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if "obs" in archive and "indices" in archive:
-                return _imitation(archive)
-            if "observations" in archive and "offsets" in archive:
-                parts = np.split(archive["observations"], archive["offsets"][1:-1])
-            else:
-                parts = [archive[name] for name in archive.files]
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        with np.load(path, allow_pickle=False) as archive, ZipFile(path) as zipped:
+            return layouts.episodes(_Archive(archive, zipped), keys, warn)
+    except (OSError, ValueError, EOFError, BadZipFile, TypeError) as error:
         raise DataError(f"not a sound NumPy archive ({error})") from error
-    return [Episode(part) for part in parts]
-
-
-def _imitation(archive: np.lib.npyio.NpzFile) -> list[Episode]:
-    """Read concatenated trajectories; ``indices`` counts actions, of which each has one fewer than states."""
-    cuts = archive["indices"]
-    states = np.split(archive["obs"], cuts + np.arange(1, len(cuts) + 1))
-    returns = [float(r.sum()) for r in np.split(archive["rews"], cuts)] if "rews" in archive else [np.nan] * len(states)
-    ended = archive["terminal"] if "terminal" in archive else np.zeros(len(states), np.bool_)
-    return [Episode(s, r, bool(e)) for s, r, e in zip(states, returns, ended, strict=True)]
 
 
 def encode(demonstrations: Demonstrations, columns: Mapping[str, NDArray[Any]]) -> bytes:

@@ -1,58 +1,75 @@
-"""Demonstrations of the method's released code, which are pickles; the only file that may read any.
+"""Demonstrations in pickles, as of the method's released code; the only file that may read any.
 
 A pickle is a program. This reader runs only what rebuilds NumPy arrays and plain containers, and refuses the rest, but
-a file from somebody you do not trust is still better left alone. It is reached by ``oodil demos convert`` alone.
+a file from somebody you do not trust is still better left alone. It is reached by ``oodil demos convert`` and
+``oodil score`` alone.
 """
 
 import pickle
+from collections import OrderedDict, defaultdict, deque
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from oodil.pipeline.data import Episode
 from oodil.pipeline.errors import DataError
 
-_ALLOWED = {
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    ("numpy.core.multiarray", "_reconstruct"),
-    ("numpy.core.multiarray", "scalar"),
+
+def _latin1(text: str, encoding: str) -> bytes:
+    """Return the bytes that pickles before protocol 3 hold as text."""
+    if encoding != "latin1":
+        raise pickle.UnpicklingError(f"it holds bytes as {encoding}")
+    return text.encode("latin1")
+
+
+_PLAIN: dict[tuple[str, str], Any] = {
+    ("collections", "OrderedDict"): OrderedDict,
+    ("collections", "defaultdict"): defaultdict,
+    ("collections", "deque"): deque,
+    ("builtins", "list"): list,
+    ("builtins", "dict"): dict,
+    ("builtins", "int"): int,
+    ("builtins", "float"): float,
+    ("builtins", "bytearray"): bytearray,
+    ("_codecs", "encode"): _latin1,
+    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "dtype"): np.dtype,
+}
+_NUMPY = {
     ("numpy._core.multiarray", "_reconstruct"),
     ("numpy._core.multiarray", "scalar"),
-    ("collections", "OrderedDict"),
+    ("numpy._core.numeric", "_frombuffer"),  # Protocol 5.
 }
-_STATES = ("obs", "observations", "states")
 
 
 class _ArraysOnly(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        if (module, name) in _ALLOWED:
-            return super().find_class(module, name)
+        # As they were called before NumPy 2 and Python 3.
+        own = module.replace("numpy.core.", "numpy._core.").replace("__builtin__", "builtins")
+        if (own, name) in _PLAIN:
+            return _PLAIN[own, name]
+        if (own, name) in _NUMPY:
+            return super().find_class(own, name)
         raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is neither an array nor a container")
 
 
-def read(path: Path) -> list[Episode]:
-    """Return the episodes of a pickle: a list of (T, S) arrays, or a dictionary or tuple that holds it.
-
-    In a dictionary the list is called obs, observations or states; in a tuple it comes first, before the actions.
-    Raises DataError.
-    """
+def read(path: Path) -> Any:
+    """Return what a pickle holds: arrays and plain containers. Raises DataError."""
     try:
         with open(path, "rb") as file:
-            content = _ArraysOnly(file, encoding="latin1").load()
+            return _ArraysOnly(file, encoding="latin1").load()
     except Exception as error:  # a damaged pickle raises whatever it likes
         raise DataError(f"not a pickle of demonstrations ({error})") from error
-    if isinstance(content, dict):
-        found = [name for name in _STATES if name in content]
-        if not found:
-            raise DataError(f"has no entry {' or '.join(_STATES)}, only {', '.join(map(str, content))}")
-        content = content[found[0]]
-    elif isinstance(content, tuple):
-        content = content[0]
-    if not isinstance(content, list | np.ndarray) or not len(content):
-        raise DataError(f"holds {type(content).__name__}, not a list of arrays")
+
+
+def read_objects(file: IO[bytes]) -> NDArray[Any]:
+    """Return an array of objects, which NumPy keeps as a pickle, from an open .npy. Raises DataError."""
     try:
-        return [Episode(np.asarray(states, np.float64)) for states in content]
-    except (TypeError, ValueError) as error:
-        raise DataError(f"holds something that is no array of states ({error})") from error
+        version = np.lib.format.read_magic(file)
+        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, _ = header(file)
+        objects: NDArray[Any] = _ArraysOnly(file, encoding="latin1").load()
+        return objects.reshape(shape)
+    except Exception as error:  # a damaged pickle raises whatever it likes
+        raise DataError(f"not an array of arrays ({error})") from error

@@ -69,8 +69,7 @@ def read_sources(results: RunResults) -> Sources | None:
         return None
     demonstrations = results.demonstrations
     labels = demonstrations.source_labels
-    known = transferable_marks(results.config)
-    marks = [known.get(label) for label in labels]
+    marks = transferable_marks(results.config, labels)
     columns = zip(labels, marks, source_looks(marks), strict=True)
     each = []
     for i, (label, transferable, look) in enumerate(columns):

@@ -2,11 +2,12 @@
 
 import hashlib
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from oodil.pipeline.artifacts import Files
+from oodil.pipeline.artifacts import Files, read_artifact
 from oodil.pipeline.config import DemonstrationsConfig, EnvironmentConfig, ExpertConfig, RunConfig
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.datasets import read_demonstrations, read_file
@@ -16,7 +17,7 @@ from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.policy import Controller, GaussianPolicy
 from oodil.pipeline.results import CollectedDemonstrations
 from oodil.pipeline.seeding import derive_key, numpy_rng
-from oodil.pipeline.stage import JobContext, Run, Stage, base_run, register
+from oodil.pipeline.stage import JobContext, Run, Stage, base_run, register, state_of
 from oodil.pipeline.stages.experts import load_expert, transfer_returns
 
 COLLECTION_SIMULATORS = 16
@@ -46,6 +47,20 @@ class DemonstrationsStage(Stage):
             for source in section.sources
         ]
         return common | flags(section) | {"sources": sources, "imitator": config.environment.dynamics}
+
+    def origin(self, run: Run) -> dict[str, Any]:
+        """Return what names the artifact.
+
+        A finished one is a copy: once its file or an expert is gone, or the run is on another machine, what their
+        content was is taken from there.
+        """
+        try:
+            return super().origin(run)
+        except (DataError, ExpertError):
+            held = read_artifact(run.directory.stage(self.name))
+            if held is None:
+                raise
+            return held.origin | {"version": self.version, "seed": run.config.seed}
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the settings without the imitator's dynamics, in which `combine` alone runs experts."""
@@ -98,42 +113,50 @@ class DemonstrationsStage(Stage):
 def load_demonstrations(run: Run) -> Demonstrations:
     """Return the demonstrations of a run whose first stage is finished, under the labels of its configuration."""
     held = CollectedDemonstrations.load(run.artifact(DemonstrationsStage.name)).demonstrations
-    labels = tuple(source.label for source in run.config.demonstrations.sources)
-    return replace(held, source_labels=labels) if labels else held
+    section = run.config.demonstrations
+    labels = tuple(source.label for source in section.sources) or section.labels
+    # A run that is continued comes first, with labels of its own.
+    earlier = held.source_labels[: len(held.source_labels) - len(labels)]
+    return replace(held, source_labels=earlier + labels) if labels else held
 
 
-def transferable_marks(config: RunConfig) -> dict[str, bool | None]:
-    """Return by label whether a source is marked transferable; those of the run that is continued have its marks."""
+def transferable_marks(config: RunConfig, labels: tuple[str, ...]) -> list[bool | None]:
+    """Return whether each source, by its label, is marked transferable; None where nothing is said of it.
+
+    Sources that a run which is continued knows by their label have its marks.
+    """
     section, base = config.demonstrations, base_run(config)
-    known = {} if base is None else transferable_marks(base.config)
-    return known | {source.label: source.transferable for source in section.sources} | section.marks
+    known = {source.label: source.transferable for source in section.sources}
+    if base is not None:
+        before = load_demonstrations(base).source_labels
+        known |= zip(before, transferable_marks(base.config, before), strict=True)
+    known |= dict.fromkeys(section.transferable, True) | dict.fromkeys(section.unmarked)
+    return [known.get(label, False if section.transferable else None) for label in labels]
 
 
-def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
-    """Raise DataError or ExpertError, before any work, if the demonstrations cannot fit the environment."""
+def check_demonstrations(config: RunConfig, observation_dim: int, run: Run | None = None) -> None:
+    """Raise DataError or ExpertError, before any work, if the demonstrations cannot fit the environment.
+
+    A ``run`` that has taken them over needs neither their file nor their experts any more.
+    """
     section = config.demonstrations
-    count = sum(source.count for source in section.sources)
+    if run is not None and state_of(DemonstrationsStage(), run).state == "done":
+        _check_count(config, len(load_demonstrations(run)), run.directory.path)
+        return
     if section.file is not None:
         demonstrations, environment = read_demonstrations(section.file)
-        count = len(demonstrations)
+        _check_count(config, len(demonstrations), section.file)
         if demonstrations.observation_dim != observation_dim:
             raise DataError(
                 f"{section.file}: states have {demonstrations.observation_dim} dimensions; "
                 f"environment {config.environment.id} has {observation_dim}"
             )
-        if environment and environment != config.environment.id:
+        # The module that registers an environment is no part of its name.
+        if environment and environment.rpartition(":")[2] != config.environment.id.rpartition(":")[2]:
             raise DataError(f"{section.file}: recorded in {environment}, but the run is for {config.environment.id}")
-        base = base_run(config)
-        labels = (*demonstrations.source_labels, *(load_demonstrations(base).source_labels if base else ()))
-        unknown = [label for label in section.marks if label not in labels]
-        if unknown:
-            known = ", ".join(repr(label) for label in dict.fromkeys(labels))
-            raise DataError(f"demonstrations.marks: no source {unknown[0]!r} in {section.file}; it has {known}")
-    if count < config.clustering.num_clusters and config.finetuning.run is None:
-        raise DataError(
-            f"{section.file or 'demonstrations.sources'}: {count} demonstration{'s' * (count > 1)} cannot make "
-            f"{config.clustering.num_clusters} clusters; set clustering.num_clusters to {count} or less, or give more"
-        )
+        _check_labels(config, demonstrations)
+    else:
+        _check_count(config, sum(source.count for source in section.sources), "demonstrations.sources")
     for source in section.sources:
         check_expert(source, EnvironmentConfig(id=config.environment.id, dynamics=source.dynamics), observation_dim)
 
@@ -161,6 +184,28 @@ def _say_what_is_raw(config: RunConfig, context: JobContext) -> None:
             f"environment {environment.id!r} has no finite bounds for {'actions' if len(raw) > 1 else 'action'} "
             f"{', '.join(map(str, raw))}: learned as they are, from a spread of 1, where others are scaled to [-1, 1]"
         )
+
+
+def _check_count(config: RunConfig, count: int, origin: str | Path) -> None:
+    """Raise DataError when there are fewer demonstrations than clusters; a run that is continued has its clusters."""
+    if config.finetuning.run is None and count < config.clustering.num_clusters:
+        raise DataError(
+            f"{origin}: {count} demonstrations cannot form {config.clustering.num_clusters} clusters; give more, or a "
+            "smaller clustering.num_clusters"
+        )
+
+
+def _check_labels(config: RunConfig, demonstrations: Demonstrations) -> None:
+    """Raise DataError for labels and marks that are not those of the file's sources."""
+    section, held = config.demonstrations, demonstrations.source_labels
+    if section.labels and len(section.labels) != len(held):
+        raise DataError(
+            f"{section.file}: has {len(held)} sources ({', '.join(held)}), but there are {len(section.labels)} labels"
+        )
+    known = section.labels or held
+    for label in (*section.transferable, *section.unmarked):
+        if label not in known:
+            raise DataError(f"{section.file}: has no source {label!r}, only {', '.join(known)}")
 
 
 def hand_written(simulators: Simulators, env_id: str) -> Controller:

@@ -24,19 +24,20 @@ class MarksWeighting(Weighting):
 
     def check(self, config: RunConfig) -> None:
         """Raise ConfigError unless some source is marked transferable."""
-        if True not in transferable_marks(config).values():
+        section = config.demonstrations
+        if not section.transferable and True not in [source.transferable for source in section.sources]:
             raise ConfigError("baselines: the oracle needs sources that are marked transferable: true")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the marks."""
-        marks = transferable_marks(config)
-        return {"transferable": list(marks.values()) if config.demonstrations.sources else marks}
+        section = config.demonstrations
+        return {"transferable": list(section.transferable) or [source.transferable for source in section.sources]}
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Look the marks up; what is not marked counts as not transferable."""
-        demonstrations, marks = load_demonstrations(run), transferable_marks(run.config)
-        by_source = np.array([float(marks.get(label) is True) for label in demonstrations.source_labels])
-        scores = by_source[demonstrations.sources]
+        demonstrations = load_demonstrations(run)
+        marks = transferable_marks(run.config, demonstrations.source_labels)
+        scores = np.array([float(mark is True) for mark in marks])[demonstrations.sources]
         intervals = np.stack((scores, scores), axis=1)
         clusters = np.full(len(scores), -1, np.int32)
         return Transferability(scores, scores / scores.sum(), clusters, intervals, threshold=0.5).files()

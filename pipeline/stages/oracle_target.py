@@ -4,6 +4,7 @@ They are collected by a stage of their own, and no other stage reads them. Like 
 method: without such an expert there would be nothing to transfer.
 """
 
+import json
 from typing import Any
 
 from oodil.pipeline.artifacts import Files
@@ -84,8 +85,10 @@ def _section(config: RunConfig) -> ExpertConfig:
     return config.oracle_target
 
 
-def _words(dynamics: dict[str, float]) -> str:
-    return ", ".join(f"{name} {value:g}" for name, value in dynamics.items()) or "the dynamics that are default"
+def _words(dynamics: dict[str, Any]) -> str:
+    return (
+        ", ".join(f"{name} {json.dumps(value)}" for name, value in dynamics.items()) or "the dynamics that are default"
+    )
 
 
 register(TargetDemonstrationsStage())

@@ -89,8 +89,8 @@ def test_sources_that_the_run_does_not_know_are_marked_in_the_command(
         config, _ = finetuning(base, other, [*SMALL, *overrides], weighting="distance")
         return oodil.run(config, workers=0, run_dir=tmp_path / "run", until="later_scores").separation("later_scores")
 
-    assert separation() == {}
-    found = separation("demonstrations.marks={unheard of: true}")
+    assert separation()["auroc"] == pytest.approx(base.separation("distance")["auroc"]), "unmarked: left out"
+    found = separation("demonstrations.transferable=[unheard of]")
     # Twice the same demonstrations: all that is told of them stays as it was.
     assert found["auroc"] == pytest.approx(base.separation("distance")["auroc"])
     assert found["share"] == pytest.approx(base.separation("distance")["share"])
@@ -98,7 +98,7 @@ def test_sources_that_the_run_does_not_know_are_marked_in_the_command(
 
 def test_marks_of_a_file_serve_an_ordinary_run_and_its_oracle(file: Path, tmp_path: Path) -> None:
     overrides = ["demonstrations.sources=[]", f"demonstrations.file={file}", "baselines=[oracle]"]
-    marked = [*overrides, "demonstrations.marks={fast: true, slow: false}"]
+    marked = [*overrides, "demonstrations.transferable=[fast]"]
     found = oodil.run(MICRO, marked, workers=0, run_dir=tmp_path / "run", until="marks")
     marks = found.marks()
     assert marks is not None and marks.tolist() == [True, False, False]
@@ -196,8 +196,8 @@ def test_bad_input_starts_nothing(base: oodil.RunResults, file: Path, tuned: ood
     other = tmp_path / "walker.safetensors"
     write_file(other, encode_demonstrations(base.demonstrations, "oodil/Walker2d-v0"))
     assert "recorded in oodil/Walker2d-v0" in refused(base.path, other)
-    assert f"no source 'quick' in {file}; it has 'fast', 'slow'" in refused(
-        base.path, file, "demonstrations.marks={quick: true}"
+    assert f"{file}: has no source 'quick', only fast, slow" in refused(
+        base.path, file, "demonstrations.transferable=[quick]"
     )
     assert "initial_std is 0.05; it must reach" in refused(base.path, file, "finetuning.initial_std=0.05")
     assert "policy_hidden is [8]; the policy that is continued has [64, 64]" in refused(

@@ -138,15 +138,15 @@ def archive(**arrays: object) -> bytes:
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.npz", archive(x=np.zeros((3, 2)), y=np.zeros((3, 4))), r"demonstration 1 has states of shape \(3, 4\)"),
-        ("a.npz", archive(x=np.zeros((3, 2)), y=np.zeros((1, 2))), r"demonstration 1 has 1 state.*at least 2"),
+        ("a.npz", archive(x0=np.zeros((3, 2)), x1=np.zeros((3, 4))), r"demonstration 1 has states of shape \(3, 4\)"),
+        ("a.npz", archive(x0=np.zeros((3, 2)), x1=np.zeros((1, 2))), r"demonstration 1 \(x1\) has 1 state.*at least 2"),
         ("a.npz", archive(x=np.array([[0.0], [np.nan]])), "demonstration 0 has the value nan in state 1"),
         ("a.npz", archive(x=np.array([[0.0], [1e300]])), "demonstration 0 has the value inf in state 1"),
-        ("a.npz", archive(x=np.array([{}, 1], object)), "not a sound NumPy archive"),
+        ("a.npz", archive(x=np.array([{}, 1], object)), "demonstration 0: entry 'x' holds object, not real numbers"),
         ("a.npz", archive(x=np.zeros((3, 2)))[:60], "not a sound NumPy archive"),
-        ("a.hdf5", b"nothing", "not a sound robomimic file"),
+        ("a.hdf5", b"nothing", "not a sound HDF5 file"),
         ("a.pkl", b"nothing", "not a pickle of demonstrations"),
-        ("a.pkl", pickle.dumps({"acts": []}), "has no entry obs or observations or states, only acts"),
+        ("a.pkl", pickle.dumps({"acts": []}), "has no entry 'x', only acts"),
         ("a.pkl", pickle.dumps([]), "holds list, not a list of arrays"),
         ("a.csv", b"", "unknown format; give FILE.npz"),
     ],
@@ -166,7 +166,7 @@ def test_entries_have_to_be_chosen_and_to_exist(robomimic_file: Path, minari_id:
         read_foreign(str(robomimic_file), "lab", ("arm", "leg"), ends_are_failures=False)
     with h5py.File(robomimic_file, "r+") as file:
         del file["data/demo_0"], file["data/demo_2"], file["data/demo_10"]
-    with pytest.raises(DataError, match="not a sound robomimic file"):
+    with pytest.raises(DataError, match="has no entry 'arm', only nothing"):
         read_foreign(str(robomimic_file), "lab", ("arm",), ends_are_failures=False)
     with pytest.raises(DataError, match="not a local Minari data set"):
         read_foreign("minari:nobody/nothing-v0", "lab", (), ends_are_failures=False)
@@ -210,7 +210,7 @@ def test_export_to_a_table(states: list[np.ndarray], tmp_path: Path) -> None:
 def test_export_to_where_they_came_from(
     states: list[np.ndarray], robomimic_file: Path, minari_id: str, tmp_path: Path
 ) -> None:
-    demonstrations = Demonstrations.of([Episode(s) for s in states], "lab")
+    demonstrations = Demonstrations.of([Episode(s) for s in states], "lab", ("arm", "box"))
     for _ in range(2):  # a second export replaces the first
         export(demonstrations, FOUND, str(robomimic_file))
         export(demonstrations, FOUND, minari_id)
@@ -222,7 +222,7 @@ def test_export_to_where_they_came_from(
     assert [entry["oodil_cluster"] for entry in metadata] == [1, 0, 1]
     assert [entry["oodil_weight"] for entry in metadata] == [0.3, 0.7, 0.0]
     assert_same(read_foreign(minari_id, "lab", (), ends_are_failures=False)[0], states)
-    fewer = Demonstrations.of([Episode(s) for s in states[:2]], "lab")
+    fewer = Demonstrations.of([Episode(s) for s in states[:2]], "lab", ("arm", "box"))
     for target in (str(robomimic_file), minari_id):
         with pytest.raises(DataError, match=r"3 (demonstrations|episodes).*the run has 2"):
             export(fewer, {name: column[:2] for name, column in FOUND.items()}, target)

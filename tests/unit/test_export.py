@@ -17,7 +17,7 @@ FOUND = Transferability(
     intervals=np.array([[0.25, 0.5], [0.0, 0.125]]),
     threshold=0.2,
 )
-HELD = Demonstrations.of([Episode(np.zeros((length, 2))) for length in (7, 2)], "a")
+HELD = Demonstrations.of([Episode(np.zeros((length, 2))) for length in (7, 2)], "a", ("pos",))
 
 
 def test_a_table_holds_intervals_and_verdicts(tmp_path: Path) -> None:
@@ -34,7 +34,7 @@ def test_verdicts_become_attributes_of_robomimic_demonstrations(tmp_path: Path) 
     path = tmp_path / "demonstrations.hdf5"
     with h5py.File(path, "w") as file:
         for n in range(2):
-            file.create_group(f"data/demo_{n}")
+            file[f"data/demo_{n}/obs/pos"] = HELD[n]
     export(HELD, FOUND.columns(), str(path))
     with h5py.File(path) as file:
         assert file["data/demo_1"].attrs["oodil_verdict"] == "not kept"

@@ -1,7 +1,7 @@
 """Commands for demonstrations: inspect, collect, convert, export."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -16,6 +16,7 @@ from oodil.cli.options import (
     show_execution,
     state_keys,
 )
+from oodil.pipeline.errors import DataError
 
 
 def inspect_demos(path: Annotated[Path, typer.Argument(help="A file of demonstrations, or a run's folder.")]) -> None:
@@ -70,26 +71,42 @@ def collect_demos(
 def convert_demos(
     sources: Annotated[
         list[str],
-        typer.Argument(help="FILE.npz, FILE.hdf5 (robomimic), FILE.pkl (released code) or minari:DATASET_ID."),
+        typer.Argument(help="FILE.npz, FILE.hdf5, FILE.pkl, FILE.parquet, a folder of LeRobot's, minari:DATASET_ID."),
     ],
     environment: Annotated[str, typer.Option(help="Id of the imitator's environment, such as oodil/Hopper-v0.")],
     output: Annotated[Path, typer.Option(help="The file to write.")] = Path("demonstrations.safetensors"),
     keys: StateKeys = "",
+    dynamics: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KEY=VALUE", help="Of the environment, if what it observes depends on it; repeatable."),
+    ] = None,
     ends_are_failures: EndsAreFailures = False,
 ) -> None:
     """Make one file of demonstrations from files in other formats; each becomes a source, named by its file."""
     from oodil.pipeline.artifacts import write_file
     from oodil.pipeline.data import Demonstrations
     from oodil.pipeline.datasets import encode_demonstrations
-    from oodil.pipeline.datasets.foreign import read_foreign
+    from oodil.pipeline.datasets.foreign import check_output, labels_of, read_foreign
+    from oodil.pipeline.environments import environment_spec
+    from oodil.pipeline.loading import apply_override
 
+    check_output(output, sources)
+    arguments: dict[str, Any] = {}
+    for each in dynamics or ():
+        apply_override(arguments, each)
+    expected = environment_spec(environment, arguments).observation_dim
     parts = []
-    for source in sources:
-        label = source if source.startswith("minari:") else Path(source).stem
-        part, recorded = read_foreign(source, label, state_keys(keys), ends_are_failures)
+    for source, label in zip(sources, labels_of(sources), strict=True):
+        part, recorded = read_foreign(source, label, state_keys(keys), ends_are_failures, warn=print)
         print(f"{source}: {len(part)} demonstrations" + (f" from {recorded}" if recorded else ""))
         parts.append(part)
-    write_file(output, encode_demonstrations(Demonstrations.joined(parts), environment))
+    joined = Demonstrations.joined(parts)
+    if joined.observation_dim != expected:
+        raise DataError(
+            f"{', '.join(sources)}: states have {joined.observation_dim} dimensions; environment {environment} has "
+            f"{expected} (with other dynamics, perhaps: --dynamics KEY=VALUE)"
+        )
+    write_file(output, encode_demonstrations(joined, environment))
     inspect_demos(output)
 
 

@@ -29,7 +29,7 @@ Bind = Annotated[str | None, typer.Option(help="Let workers of other machines jo
 Keys = Annotated[Path | None, typer.Option(help="Folder of keys, made by `oodil keys new`; --bind needs it.")]
 EngineName = Annotated[Literal["local", "ray"], typer.Option(help="This machine's processes, or a Ray cluster.")]
 StateKeys = Annotated[
-    str, typer.Option("--keys", help="For observations with several entries: those of a state, joined by commas.")
+    str, typer.Option("--keys", help="For observations with several entries: those of a state, such as obs/arm,box.")
 ]
 EndsAreFailures = Annotated[
     bool, typer.Option(help="Episodes that the environment ended are ones in which the demonstrator failed.")
@@ -39,7 +39,7 @@ TrustCluster = Annotated[bool, typer.Option("--trust-cluster", help="Use a Ray c
 
 def state_keys(keys: str) -> tuple[str, ...]:
     """Return the names in an option that joins them by commas."""
-    return tuple(key for key in keys.split(",") if key)
+    return tuple(key.strip() for key in keys.split(",") if key.strip())
 
 
 def engine_of(

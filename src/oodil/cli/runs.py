@@ -63,7 +63,7 @@ def resume(
     from oodil.orchestrator import check_inputs, choose, read_run, refuse_to_replace
 
     opened = read_run(run_dir)
-    check_inputs(opened.config)
+    check_inputs(opened.config, opened)
     chosen = choose(opened.config, until)
     refuse_to_replace(opened, force or ())
     execute_and_report(opened, chosen, engine_of(opened.config, engine, workers, bind, keys, trust_cluster), force)
