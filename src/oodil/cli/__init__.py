@@ -10,6 +10,7 @@ from typing import Any
 import typer
 
 from oodil.cli import demonstrations, machines, policies, runs
+from oodil.cli.encoding import fit_encoding
 from oodil.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_STOPPED
 from oodil.pipeline.errors import OodilError, UnfinishedError
 
@@ -69,8 +70,5 @@ app.add_typer(keys_app, name="keys")
 
 def main() -> None:
     """Entry point of the ``oodil`` command."""
+    fit_encoding()
     app()
-
-
-if __name__ == "__main__":
-    main()
