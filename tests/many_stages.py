@@ -15,6 +15,7 @@ def main(stages: int, jobs: int) -> None:
     """Run that many stages of that many jobs, two at a time."""
     costs = {f"stage-{n}": StageCost(1_000, 1.0, jobs) for n in range(stages)}
     over = threading.Event()
+    sys.setswitchinterval(1e-4)  # Or each line would wait for the busy thread.
     threading.Thread(target=lambda: [sum(range(1000)) for _ in iter(over.is_set, True)], daemon=True).start()
     now = 0.0
     with Display(RunCost(costs, 10_000.0, 2), clock=lambda: now) as display:
@@ -24,9 +25,9 @@ def main(stages: int, jobs: int) -> None:
                 pair = [f"cluster-{first}", f"cluster-{first + 1}-training-2"]
                 for job in pair:
                     display.event(Event(job, Started(1)))
-                for done in (0, 4_000, 10_000):
+                for done in (0, 4_000, 9_000, 10_000):
                     for job in pair:
-                        now += 0.5
+                        now += 0.25
                         display.event(Event(job, Progress(done, 10_000, METRICS)))
                 for job in pair:
                     display.event(Event(job, Finished(DONE)))

@@ -2,12 +2,11 @@
 
 import os
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from oodil.pipeline.config import RunConfig
 from oodil.pipeline.environments import make_batch
 from oodil.pipeline.stage import Run, Stage, state_of
 
@@ -44,14 +43,14 @@ class RunCost:
         told = f"to do: {_counted(steps)} environment steps" if steps else "to do: no environment steps"
         if self.workers is not None:
             told += f", about {_minutes(minutes)}" if minutes >= 1 else ", a minute or less"
-        where = "" if self.workers is None else f"{self.workers} workers, " if self.workers > 1 else "one process, "
-        return f"{told} ({where}{self.steps_per_s:,.0f} steps/s a core)"
+        return f"{told} ({self.steps_per_s:,.0f} steps/s a core)"
 
 
 def run_cost(run: Run, chosen: Sequence[Stage], workers: int | None, force: Collection[str] = ()) -> RunCost:
     """Return what the chosen stages of a run will cost; ``workers`` is None for an engine that alone knows it."""
     config = run.config
-    step_s = step_seconds(config)
+    environment = config.environment
+    step_s = step_seconds(environment.id, environment.dynamics, config.imitation.gail.simulators_per_group)
     costs: dict[str, StageCost] = {}
     for stage in chosen:
         computed = any(costs[name].seconds for name in stage.inputs if name in costs) or stage.name in force
@@ -68,11 +67,9 @@ def run_cost(run: Run, chosen: Sequence[Stage], workers: int | None, force: Coll
     return RunCost(costs, 1 / step_s, workers)
 
 
-def step_seconds(config: RunConfig) -> float:
-    """Return how long a step of the imitator's environment takes on one core, under random actions."""
-    environment = config.environment
-    count = config.imitation.gail.simulators_per_group
-    simulators = make_batch(environment.id, environment.dynamics, count)
+def step_seconds(env_id: str, dynamics: Mapping[str, float], count: int) -> float:
+    """Return how long a step of an environment takes on one core, by so many simulators under random actions."""
+    simulators = make_batch(env_id, dynamics, count)
     rng = np.random.default_rng(0)
     for index in range(count):
         simulators.reset(index, seed=index)

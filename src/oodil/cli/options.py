@@ -20,7 +20,12 @@ ConfigSource = Annotated[
 ]
 Overrides = Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Fields to override.")]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN_DIR", help="The folder of a run.")]
-Workers = Annotated[int | None, typer.Option("--workers", "-w", min=0, help="Parallel processes; 0 runs inline.")]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        "--workers", "-w", min=0, help="Parallel processes, 0 for this one alone; default: runtime.workers (2)."
+    ),
+]
 Until = Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")]
 Force = Annotated[
     list[str] | None, typer.Option(metavar="STAGE", help="Compute a finished stage again; can be repeated.")

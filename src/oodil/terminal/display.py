@@ -87,7 +87,7 @@ class Display(Observer):
     def say(self, message: str, style: str = "") -> None:
         """Print a message above the bars."""
         text = Text(message, style)
-        if not self._console.is_interactive:
+        if not self._is_live:
             text = Text.assemble(time.strftime("%H:%M:%S  "), text)
         self._console.print(text, soft_wrap=True)
 
