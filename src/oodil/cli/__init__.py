@@ -10,8 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from oodil import __version__
-from oodil.cli import demonstrations, machines, policies, runs
-from oodil.cli.doctor import doctor
+from oodil.cli import demonstrations, doctor, machines, policies, runs
 from oodil.cli.encoding import fit_encoding
 from oodil.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_STOPPED
 from oodil.pipeline.errors import OodilError, UnfinishedError
@@ -69,7 +68,7 @@ for _command in (
     policies.score,
     policies.finetune,
     runs.bench,
-    doctor,
+    doctor.doctor,
 ):
     app.command()(_command)
 

@@ -49,7 +49,7 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="One JSON object
     """Look at this machine: versions, speed, rendering, Ray, disk; each line is ok or says what to do."""
     findings = []
     for look in LOOKS:
-        for finding in look():
+        for finding in _seen(look):
             findings.append(finding)
             if not as_json:
                 print(f"{finding.state:<10} {finding.name:<12} {finding.found}")
@@ -57,6 +57,15 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="One JSON object
                     print(f"{'':<23} -> {finding.advice}", flush=True)
     if as_json:
         print(json.dumps({each.name: {"state": each.state} | asdict(each) for each in findings}, indent=2))
+
+
+def _seen(look: "Look") -> Iterator[Finding]:
+    """Yield what is found; a machine on which one thing is broken is told the others, too."""
+    try:
+        yield from look()
+    except Exception as error:
+        reason = (str(error).splitlines() or [""])[0]
+        yield Finding(look.__name__.removeprefix("_"), f"{type(error).__name__}: {reason}", "mend this first")
 
 
 def _versions() -> Iterator[Finding]:
@@ -132,8 +141,7 @@ def _rendering() -> Iterator[Finding]:
         env.render()
         env.close()
     except Exception as error:  # Whatever a driver raises is what is to be found here.
-        reason = (str(error).splitlines() or [""])[0]
-        yield Finding("rendering", f"{backend} makes no picture: {type(error).__name__}: {reason}", advice)
+        yield Finding("rendering", f"{backend} makes no picture: {error!r}"[:160], advice)
     else:
         yield Finding("rendering", f"{backend} makes pictures")
 
@@ -145,4 +153,5 @@ def _version(package: str) -> str | None:
         return None
 
 
-LOOKS: tuple[Callable[[], Iterator[Finding]], ...] = (_versions, _threads, _rate, _ray, _disk, _rendering)
+Look = Callable[[], Iterator[Finding]]
+LOOKS: tuple[Look, ...] = (_versions, _threads, _rate, _ray, _disk, _rendering)
