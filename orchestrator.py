@@ -99,9 +99,7 @@ def refuse_to_replace(run: Run, force: Collection[str]) -> None:
 
     A stage whose input was replaced follows its input and needs no word of its own.
     """
-    chosen = stages(run.config)
-    for name in force:
-        choose(run.config, until=name)
+    chosen = choose(run.config, force=force)
     replaced = set(force)
     for stage in chosen:
         if replaced.intersection(stage.inputs):
@@ -128,12 +126,16 @@ def check_inputs(config: RunConfig, run: Run | None = None) -> None:
         check_target(config, spec.observation_dim)
 
 
-def choose(config: RunConfig, until: str | None = None) -> list[Stage]:
-    """Return the stages of a run up to one of them, or all. Raises ConfigError, naming those there are."""
+def choose(config: RunConfig, until: str | None = None, force: Collection[str] = ()) -> list[Stage]:
+    """Return the stages of a run up to one of them, or all.
+
+    Raises ConfigError, naming those there are, for a name that is none of them, be it of one to compute again.
+    """
     chosen = stages(config)
     names = [stage.name for stage in chosen]
-    if until is not None and until not in names:
-        raise ConfigError(f"no stage {until!r}; this run has {', '.join(names)}")
+    for name in (*force, *([] if until is None else [until])):
+        if name not in names:
+            raise ConfigError(f"no stage {name!r}; this run has {', '.join(names)}")
     return chosen[: names.index(until) + 1] if until else chosen
 
 
@@ -184,7 +186,7 @@ def _execute_stage(
     outcome = engine.run_jobs(stage, run, pending, observer.event, should_stop)
     if outcome.stopped or outcome.failed:
         _record(run.directory, "stage_interrupted", stage=stage.name, seconds=time.monotonic() - started)
-        raise _unfinished(run, stage.name, outcome)
+        raise _unfinished(run, stage, outcome)
     files = stage.combine(run)
     if files is not None:
         write_artifact(run.directory.stage(stage.name), stage.origin(run), files, library_versions())
@@ -193,14 +195,14 @@ def _execute_stage(
     observer.stage_finished(stage.name, seconds)
 
 
-def _unfinished(run: Run, stage: str, outcome: Outcome) -> UnfinishedError:
+def _unfinished(run: Run, stage: Stage, outcome: Outcome) -> UnfinishedError:
     """Say what became of a stage's jobs, and how to go on."""
-    failures = "".join(f"{stage}/{job} failed:\n{traceback}\n\n" for job, traceback in outcome.failed.items())
+    failures = "".join(f"{stage.name}/{job} failed:\n{traceback}\n\n" for job, traceback in outcome.failed.items())
+    done = len(stage.jobs(run)) - len(outcome.failed) - len(outcome.not_run)
     return UnfinishedError(
-        f"{failures}{stage}: {len(outcome.done)} jobs done, {len(outcome.failed)} failed, "
-        f"{len(outcome.not_run)} not finished. What is finished is kept; go on with: "
-        f"oodil resume {run.directory.path}",
-        stage,
+        f"{failures}{stage.name}: {done} jobs done, {len(outcome.failed)} failed, {len(outcome.not_run)} not finished. "
+        f"What is finished is kept; go on with:\n  oodil resume {run.directory.path}",
+        stage.name,
         outcome.failed,
     )
 

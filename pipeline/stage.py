@@ -68,6 +68,27 @@ def _finished(artifact: Artifact | None, name: str) -> Artifact:
     return artifact
 
 
+LEARNING_S = 25e-6
+"""Seconds of one core that learning takes for each environment step, measurements along the way included; on a machine
+that does 15,000 steps of Hopper in a second (docs/measurements.md)."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a stage is expected to cost; what is not known before its inputs are is left out."""
+
+    env_steps: int = 0
+    """As `Stage.env_steps` will count them."""
+    core_s: float = 0.0
+    """Seconds of one core, of all jobs together."""
+    jobs: int = 1
+
+    @classmethod
+    def of_training(cls, env_steps: int, step_s: float, jobs: int = 1) -> "Cost":
+        """Return the cost of trainings that take so many environment steps together."""
+        return cls(env_steps, env_steps * (step_s + LEARNING_S), jobs)
+
+
 class Stage(ABC):
     """One step of the pipeline."""
 
@@ -113,6 +134,10 @@ class Stage(ABC):
     def env_steps(self, run: Run) -> int:
         """Return the environment steps that its finished artifact took; 0 for a stage without a simulator."""
         return 0
+
+    def cost(self, config: RunConfig, step_s: float) -> Cost:
+        """Return what it is expected to cost where a core takes ``step_s`` seconds for an environment step."""
+        return Cost()
 
     def origin(self, run: Run) -> dict[str, Any]:
         """Return what names the stage's artifact: stage, version, seed, settings, and the content of its inputs."""

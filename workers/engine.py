@@ -37,6 +37,10 @@ class Outcome:
 class Engine(Protocol):
     """Runs the jobs of a stage."""
 
+    @property
+    def workers(self) -> int | None:
+        """How many processes compute at the same time; 0 for the caller's own alone, None if only the engine knows."""
+
     def run_jobs(self, stage: Stage, run: Run, jobs: list[str], on_event: OnEvent, should_stop: ShouldStop) -> Outcome:
         """Run jobs until each is done or has failed; one failure does not end the others.
 

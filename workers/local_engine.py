@@ -44,22 +44,22 @@ class LocalEngine:
             raise ConfigError(f"workers is {workers}; it cannot be negative")
         if workers:
             refuse_long_path(Path())
-        self._workers = workers
+        self.workers = workers
         self._access = access
         """Where rollout workers of other machines may join, if they may."""
 
     def __str__(self) -> str:
-        return f"local, {self._workers} workers"
+        return f"local, {self.workers} workers"
 
     def run_jobs(self, stage: Stage, run: Run, jobs: list[str], on_event: OnEvent, should_stop: ShouldStop) -> Outcome:
         """Run jobs until each is done or has failed; see `Engine`."""
         ledger = JobLedger(jobs, run.config.runtime, on_event)
-        if not self._workers:
+        if not self.workers:
             _run_inline(stage, run, jobs, ledger, should_stop)
             return ledger.outcome()
         refuse_main(stage)
         # As many jobs as cores are done soonest side by side: what a job collects itself needs no messages.
-        distributed = stage.distributed and (self._access is not None or len(jobs) == 1 or len(jobs) < self._workers)
+        distributed = stage.distributed and (self._access is not None or len(jobs) == 1 or len(jobs) < self.workers)
         with (
             private_endpoint(run.directory.path) if distributed else nullcontext("") as endpoint,
             Supervisor(run.directory.logs(), stage.name, _PRELOAD) as supervisor,
@@ -73,8 +73,8 @@ class LocalEngine:
                     shared["keys"] = str(self._access.keys)
                     arguments["address"] = self._access.address
                 arguments |= shared
-                workers = {f"{_WORKER}{index}": shared for index in range(self._workers)}
-            parallel = 1 if distributed else self._workers
+                workers = {f"{_WORKER}{index}": shared for index in range(self.workers)}
+            parallel = 1 if distributed else self.workers
             processes = _Processes(supervisor, run.config.runtime, ledger, arguments, workers, on_event)
             processes.run(jobs, parallel, should_stop)
         return ledger.outcome()

@@ -75,6 +75,9 @@ def _refuse_unless(acceptable: bool) -> None:
 class RayEngine:
     """Runs jobs as Ray tasks; a distributed stage's job has its units collected by Ray tasks, too."""
 
+    workers = None
+    """The cluster alone knows."""
+
     def __str__(self) -> str:
         return "ray"
 

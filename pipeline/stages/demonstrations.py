@@ -17,7 +17,7 @@ from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.policy import Controller, GaussianPolicy
 from oodil.pipeline.results import CollectedDemonstrations
 from oodil.pipeline.seeding import derive_key, numpy_rng
-from oodil.pipeline.stage import JobContext, Run, Stage, base_run, register, state_of
+from oodil.pipeline.stage import Cost, JobContext, Run, Stage, base_run, register, state_of
 from oodil.pipeline.stages.experts import load_expert, transfer_returns
 
 COLLECTION_SIMULATORS = 16
@@ -65,6 +65,15 @@ class DemonstrationsStage(Stage):
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the settings without the imitator's dynamics, in which `combine` alone runs experts."""
         return {name: value for name, value in self.settings(config).items() if name != "imitator"}
+
+    def cost(self, config: RunConfig, step_s: float) -> Cost:
+        """Return the cost of whole episodes of every source, of which none has to be thrown away."""
+        sources = config.demonstrations.sources
+        if not sources:
+            return Cost()
+        rounds = sum(-(-source.count // COLLECTION_SIMULATORS) for source in sources)
+        limit = environment_spec(config.environment.id, config.environment.dynamics).max_episode_steps
+        return Cost(core_s=rounds * COLLECTION_SIMULATORS * limit * step_s, jobs=len(sources))
 
     def jobs(self, run: Run) -> list[str]:
         """Return one job per source, or the stage itself for a file."""

@@ -25,7 +25,7 @@ from oodil.pipeline.evaluation import evaluate
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.results import Evaluation
 from oodil.pipeline.seeding import Key, derive_key
-from oodil.pipeline.stage import JobContext, Run, Stage, register
+from oodil.pipeline.stage import Cost, JobContext, Run, Stage, register
 from oodil.pipeline.versions import library_versions
 
 TRAININGS = 2
@@ -75,6 +75,11 @@ class ExpertsStage(Stage):
         }
         training = EXPERT_TRAINING.model_dump(mode="json")
         return {"environment": config.environment.id, "sources": sources, "training": training}
+
+    def cost(self, config: RunConfig, step_s: float) -> Cost:
+        """Return the cost of all trainings."""
+        jobs = TRAININGS * sum(source.expert_folder is not None for source in config.demonstrations.sources)
+        return Cost.of_training(jobs * EXPERT_TRAINING.total_steps, step_s, max(jobs, 1))
 
     def jobs(self, run: Run) -> list[str]:
         """Return a job per source and seed; hand-written experts have none."""

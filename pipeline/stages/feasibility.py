@@ -21,7 +21,7 @@ from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.results import FeasibilityScale, Tracker, Transferability
 from oodil.pipeline.seeding import derive_key, torch_seed
-from oodil.pipeline.stage import JobContext, Run, register
+from oodil.pipeline.stage import Cost, JobContext, Run, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 from oodil.pipeline.stages.policies import PolicyStage
 from oodil.pipeline.stages.weighting import CannotScoreError, Weighting, refuse_other_states
@@ -52,6 +52,10 @@ class FeasibilityWeighting(Weighting):
             "steps": config.cluster_steps,
             "environment": environment,
         }
+
+    def cost(self, config: RunConfig, step_s: float) -> Cost:
+        """Return the cost of the one policy."""
+        return Cost.of_training(config.cluster_steps, step_s)
 
     def jobs(self, run: Run) -> list[str]:
         """Return the one policy."""
@@ -113,6 +117,10 @@ class PerSourceFeasibility(FeasibilityWeighting):
 
     name = "feasibility_per_source"
     title = "f-MDP, one policy per source"
+
+    def cost(self, config: RunConfig, step_s: float) -> Cost:
+        """Return the cost of all policies; how many sources a file has is not known before it is read."""
+        return Cost.of_training(config.cluster_steps, step_s, len(config.demonstrations.sources) or 1)
 
     def jobs(self, run: Run) -> list[str]:
         """Return one job per source that has demonstrations, named by its number."""

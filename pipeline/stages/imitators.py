@@ -16,7 +16,7 @@ from oodil.pipeline.environments import environment_spec, make_batch
 from oodil.pipeline.evaluation import distance_of
 from oodil.pipeline.results import Assignment, Imitator, ScoreHistory, TrainedImitators
 from oodil.pipeline.seeding import derive_key, torch_seed
-from oodil.pipeline.stage import JobContext, Run, Stage, register
+from oodil.pipeline.stage import Cost, JobContext, Run, Stage, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 
 if TYPE_CHECKING:
@@ -122,6 +122,11 @@ class ImitatorsStage(Stage):
     def env_steps(self, run: Run) -> int:
         """Return the environment steps of all imitators together."""
         return TrainedImitators.load(run.artifact(self.name)).env_steps
+
+    def cost(self, config: RunConfig, step_s: float) -> Cost:
+        """Return the cost of all imitators if no cluster is empty."""
+        gail, jobs = config.transferability.gail, config.clustering.num_clusters * config.transferability.num_trainings
+        return Cost.of_training(jobs * gail.num_iterations * gail.steps_per_iteration, step_s, jobs)
 
 
 def cluster_of(job: str) -> int:

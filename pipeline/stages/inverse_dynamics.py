@@ -23,7 +23,7 @@ from oodil.pipeline.following import ModelFollower
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.results import Following, Policy, Reproducibility, Transferability
 from oodil.pipeline.seeding import derive_key, torch_seed
-from oodil.pipeline.stage import JobContext, JobStoppedError, Run, register
+from oodil.pipeline.stage import Cost, JobContext, JobStoppedError, Run, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 from oodil.pipeline.stages.reproducibility import ReproducibilityStage, follow, section_of
 from oodil.pipeline.stages.weighting import Weighting, refuse_other_states
@@ -68,6 +68,12 @@ class InverseDynamics(Weighting):
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the imitator's environment, and how it is explored and learned from."""
         return config.inverse_dynamics.model_dump() | {"environment": config.environment.settings()}
+
+    def cost(self, config: RunConfig, step_s: float) -> Cost:
+        """Return the cost of exploration; what the model and the demonstrations take comes on top."""
+        how = _exploration(config)
+        env_steps = how.num_iterations * how.steps_per_iteration
+        return Cost(env_steps, env_steps * step_s)
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Explore, learn the model, follow what was held out and every demonstration, and turn errors into scores."""

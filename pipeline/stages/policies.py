@@ -12,7 +12,7 @@ from oodil.pipeline.environments import environment_spec
 from oodil.pipeline.evaluation import distance_of, evaluate
 from oodil.pipeline.results import LearningCurve, Policy, Training, Trainings, discriminator_file, value_file
 from oodil.pipeline.seeding import derive_key, torch_seed
-from oodil.pipeline.stage import JobContext, Run, Stage, register, stage_named
+from oodil.pipeline.stage import Cost, JobContext, Run, Stage, register, stage_named
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 from oodil.pipeline.stages.weighting import Weighting
 
@@ -76,6 +76,11 @@ class PolicyStage(Stage):
     def demonstrations(self, run: Run) -> Demonstrations:
         """Return what it learns from."""
         return load_demonstrations(run)
+
+    def cost(self, config: RunConfig, step_s: float) -> Cost:
+        """Return the cost of all trainings."""
+        gail, jobs = self.gail(config), config.imitation.num_trainings
+        return Cost.of_training(jobs * gail.num_iterations * gail.steps_per_iteration, step_s, jobs)
 
     def weights(self, run: Run) -> NDArray[np.float64]:
         """Return (N,) weights of the demonstrations."""

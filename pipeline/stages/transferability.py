@@ -24,13 +24,15 @@ from oodil.pipeline.results import (
     load_cluster_model,
 )
 from oodil.pipeline.seeding import derive_key, numpy_rng
-from oodil.pipeline.stage import JobContext, Run, register
+from oodil.pipeline.stage import Cost, JobContext, Run, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 from oodil.pipeline.stages.imitators import ClusterJob, ImitatorsStage, cluster_of, load_assignment
 from oodil.pipeline.stages.weighting import Weighting
 
 READ_EPISODES = 32
 """Fresh episodes of an imitator that its demonstrations are held against."""
+READING_STEP_S = 7e-3
+"""Seconds of one core that a step of a repetition takes with batches of 512; in quickstarts, episodes included."""
 
 
 class TransferabilityStage(Weighting):
@@ -67,6 +69,15 @@ class TransferabilityStage(Weighting):
     def jobs(self, run: Run) -> list[str]:
         """Return one job per imitator, under its name."""
         return ImitatorsStage().jobs(run)
+
+    def cost(self, config: RunConfig, step_s: float) -> Cost:
+        """Return the cost of all readings if no cluster is empty."""
+        section = config.transferability
+        if section.reading.discriminator == "last":
+            return Cost()
+        jobs, reading = config.clustering.num_clusters * section.num_trainings, section.reading
+        job_s = reading.steps * reading.repetitions * READING_STEP_S * reading.batch_size / 512
+        return Cost(core_s=jobs * job_s, jobs=jobs)
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Read the demonstrations of a cluster against fresh episodes of its imitator, or by its own discriminator."""

@@ -62,7 +62,7 @@ def run(
     """
     loaded = load_config(config, overrides)
     check_inputs(loaded)
-    chosen = choose(loaded, until)
+    chosen = choose(loaded, until, force)
     where = engine or LocalEngine(loaded.runtime.workers if workers is None else workers)
     opened = open_folder(default_folder(loaded) if run_dir is None else Path(run_dir), loaded, force)
     execute(opened, chosen, where, observer, should_stop, force)

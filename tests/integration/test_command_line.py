@@ -11,6 +11,7 @@ import safetensors.numpy
 import yaml
 from typer.testing import CliRunner
 
+import oodil
 from oodil.cli import app
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.datasets import encode_demonstrations
@@ -167,6 +168,49 @@ def test_a_run_directory_of_another_run(tmp_path: Path) -> None:
     assert described["stages"]["imitation"]["state"] == "pending"
     shown = CliRunner().invoke(app, ["demos", "inspect", str(run_dir)]).output
     assert "7 demonstrations" in shown and "fast" in shown and "slow" in shown
+
+
+@pytest.mark.parametrize("option", ["--until", "--force"])
+def test_a_stage_that_is_not_there_is_refused_before_anything_is_written(tmp_path: Path, option: str) -> None:
+    output = refused("run", str(MICRO), "--run-dir", str(tmp_path / "run"), option, "transfer")
+    assert "no stage 'transfer'; this run has demonstrations, clustering, imitators, transferability, imit" in output
+    assert not (tmp_path / "run").exists()
+
+
+def test_version_help_and_completion(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert CliRunner().invoke(app, ["--version"]).output == f"oodil {oodil.__version__}\n"
+    helped = CliRunner().invoke(app, [])
+    assert helped.exit_code == 0 and "doctor" in helped.output
+    monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
+    completed = CliRunner().invoke(
+        app,
+        [],
+        prog_name="oodil",
+        env={"_OODIL_COMPLETE": "complete_bash", "COMP_WORDS": "oodil do", "COMP_CWORD": "1"},
+    )
+    assert completed.output.split() == ["doctor"]
+
+
+def test_the_doctor_looks_at_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("oodil.cli.doctor.FREE_GB", 1e9)
+    monkeypatch.chdir(tmp_path)
+    found = json.loads(CliRunner().invoke(app, ["doctor", "--json"]).output)
+    names = {"version", "libraries", "extras", "cores", "threads", "GPU", "simulator", "Ray", "disk", "rendering"}
+    assert set(found) == names
+    assert (found["version"]["state"], found["libraries"]["state"]) == ("ok", "ok")
+    assert found["disk"]["state"] == "attention" and str(tmp_path) in found["disk"]["found"]
+    assert "--run-dir" in found["disk"]["advice"]
+    assert found["GPU"]["state"] == "ok" and "not used" in found["GPU"]["found"]
+
+
+def test_the_doctor_goes_on_when_something_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> float:
+        raise RuntimeError("no simulator here\nand a second line")
+
+    monkeypatch.setattr("oodil.estimate.step_seconds", broken)
+    output = CliRunner().invoke(app, ["doctor"]).output
+    assert "attention  rate         RuntimeError: no simulator here\n" in output
+    assert "disk" in output and "rendering" in output
 
 
 def test_what_is_no_run(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ UNSAFE_MODULES = {
 }
 UNSAFE_CALLS = {"torch.load", "torch.save", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "np.load", "numpy.load"}
 UNSAFE_METHODS = {"send_pyobj", "recv_pyobj"}
-COMMAND_LINE = ("cli", "terminal", "bench")
+COMMAND_LINE = ("cli", "terminal", "bench", "estimate")
 TOP = ("orchestrator", *COMMAND_LINE)
 BOTTOM = {
     "errors": (),
@@ -42,7 +42,7 @@ CONVERTERS = {"pipeline/datasets/official.py"}
 
 def sources() -> list[str]:
     """Return all source files of the program, relative to the root, each under one name: links are not followed."""
-    folders = ("pipeline", "workers", "examples", "src/oodil/cli")
+    folders = ("pipeline", "workers", "examples", "src/oodil/cli", "src/oodil/terminal")
     found = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
     found += [path for path in (ROOT / "src" / "oodil").glob("*.py") if not path.is_symlink()]
     return sorted(str(path.relative_to(ROOT)) for path in [*found, *ROOT.glob("*.py")])

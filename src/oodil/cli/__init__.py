@@ -5,11 +5,13 @@ No mathematics and no sockets. Heavy imports follow argument parsing, so that ``
 
 import os
 import sys
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
-from oodil.cli import demonstrations, machines, policies, runs
+from oodil import __version__
+from oodil.cli import demonstrations, doctor, machines, policies, runs
+from oodil.cli.encoding import fit_encoding
 from oodil.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_STOPPED
 from oodil.pipeline.errors import OodilError, UnfinishedError
 
@@ -36,11 +38,25 @@ class _Commands(typer.core.TyperGroup):
 app = typer.Typer(
     name="oodil",
     cls=_Commands,
-    help="Imitation learning from demonstrators whose dynamics differ from your robot's.",
-    no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+
+@app.callback(invoke_without_command=True)
+def _oodil(
+    ctx: typer.Context,
+    version: Annotated[bool, typer.Option("--version", is_eager=True, help="Show the version and exit.")] = False,
+) -> None:
+    """Imitation learning from demonstrators whose dynamics differ from your robot's."""
+    if version:
+        print(f"oodil {__version__}")
+    elif ctx.invoked_subcommand is None:
+        print(ctx.get_help())
+    else:
+        return
+    raise typer.Exit
+
+
 for _command in (
     runs.run,
     runs.resume,
@@ -52,6 +68,7 @@ for _command in (
     policies.score,
     policies.finetune,
     runs.bench,
+    doctor.doctor,
 ):
     app.command()(_command)
 
@@ -69,8 +86,5 @@ app.add_typer(keys_app, name="keys")
 
 def main() -> None:
     """Entry point of the ``oodil`` command."""
+    fit_encoding()
     app()
-
-
-if __name__ == "__main__":
-    main()

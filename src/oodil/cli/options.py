@@ -20,7 +20,12 @@ ConfigSource = Annotated[
 ]
 Overrides = Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Fields to override.")]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN_DIR", help="The folder of a run.")]
-Workers = Annotated[int | None, typer.Option("--workers", "-w", min=0, help="Parallel processes; 0 runs inline.")]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        "--workers", "-w", min=0, help="Parallel processes, 0 for this one alone; default: runtime.workers (2)."
+    ),
+]
 Until = Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")]
 Force = Annotated[
     list[str] | None, typer.Option(metavar="STAGE", help="Compute a finished stage again; can be repeated.")
@@ -87,11 +92,18 @@ def execute_and_report(opened: "Run", chosen: "list[Stage]", engine: "Engine", f
 
 def show_execution(opened: "Run", chosen: "list[Stage]", engine: "Engine", force: list[str] | None = None) -> None:
     """Execute the stages and show how far they are; Ctrl-C once stops politely, twice at once."""
+    from oodil.estimate import run_cost
     from oodil.orchestrator import execute
     from oodil.terminal import Display, stop_flag
 
+    cost = run_cost(opened, chosen, engine.workers, force or ())
     try:
-        with Display() as display, stop_flag(display.stopping) as should_stop:
+        with Display(cost) as display, stop_flag(display.stopping) as is_asked_to_stop:
+
+            def should_stop() -> bool:
+                display.tick()  # Engines ask all the time, also while nothing is reported.
+                return is_asked_to_stop()
+
             execute(opened, chosen, engine, display, should_stop, force or ())
     except KeyboardInterrupt:
         print(f"\nstopped at once; go on with: oodil resume {opened.directory.path}", file=sys.stderr)

@@ -44,7 +44,7 @@ def run(
 
     config = load_config(config_source, overrides)
     check_inputs(config)
-    chosen = choose(config, until)
+    chosen = choose(config, until, force or ())
     where = engine_of(config, engine, workers, bind, keys, trust_cluster)
     execute_and_report(open_run(run_dir or default_folder(config), config, force or ()), chosen, where, force)
 
@@ -64,7 +64,7 @@ def resume(
 
     opened = read_run(run_dir)
     check_inputs(opened.config, opened)
-    chosen = choose(opened.config, until)
+    chosen = choose(opened.config, until, force or ())
     refuse_to_replace(opened, force or ())
     execute_and_report(opened, chosen, engine_of(opened.config, engine, workers, bind, keys, trust_cluster), force)
 

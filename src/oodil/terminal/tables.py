@@ -1,155 +1,26 @@
-"""How a run looks in a terminal: live progress, plain lines elsewhere, tables at the end."""
+"""What a run and its demonstrations have come to, as tables."""
 
 import os
-import signal
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from oodil.orchestrator import Observer
 from oodil.pipeline.runs import RunResults, shown_return
 from oodil.pipeline.verdicts import MEANING, VerdictTable
-from oodil.workers.reports import DONE, AttemptFailed, Event, Finished, Replaced, Started, Warn
-from oodil.workers.reports import Progress as JobProgress
+from oodil.terminal.words import duration
 
 if TYPE_CHECKING:
     from oodil.pipeline.data import Demonstrations
     from oodil.pipeline.results import Transferability
     from oodil.pipeline.scoring import Scored
 
-PLAIN_INTERVAL_S = 10.0
-"""Seconds between lines about one job where there is no terminal."""
-SHOWN_METRICS = ("return", "length", "loss", "value_loss")
-"""Figures of a job that are shown beside its bar."""
 MOST_ROWS = 50
 """Demonstrations in a table; a file takes the others."""
-
-
-@contextmanager
-def stop_flag(announce: Callable[[], None]) -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C or SIGTERM into a polite stop; a second one ends the run at once."""
-    received: list[int] = []
-
-    def handle(number: int, _frame: Any) -> None:
-        received.append(number)
-        if len(received) > 1:
-            raise KeyboardInterrupt
-        announce()
-
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(received)
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-
-class Display(Observer):
-    """What a user sees of a run: live progress on a terminal, plain lines elsewhere."""
-
-    def __init__(self) -> None:
-        self._console = Console()
-        self._progress = Progress(
-            TextColumn("  {task.description:<18}"),
-            BarColumn(bar_width=24),
-            TextColumn("{task.percentage:>3.0f}%"),
-            TextColumn("{task.fields[rate]:>12}"),
-            TextColumn("{task.fields[figures]}"),
-            TimeElapsedColumn(),
-            TextColumn("eta"),
-            TimeRemainingColumn(),
-            console=self._console,
-            disable=not self._console.is_terminal,
-        )
-        self._bars: dict[str, Any] = {}
-        self._started: dict[str, tuple[float, int]] = {}
-        self._spoken: dict[str, float] = {}
-
-    def __enter__(self) -> "Display":
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Take the live part away; what was said stays."""
-        self._progress.stop()
-
-    def say(self, message: str) -> None:
-        """Print one line above the live part."""
-        self._console.print(message, highlight=False, soft_wrap=True)
-
-    def stopping(self) -> None:
-        """Say that a stop was heard."""
-        self.say("stopping after a checkpoint; press Ctrl-C again to stop at once")
-
-    def stage_reused(self, stage: str) -> None:
-        """Say that a finished stage is taken as it is."""
-        self.say(f"[green]✓[/] {stage}: reused")
-
-    def stage_started(self, stage: str, reason: str, jobs: int) -> None:
-        """Say that a stage begins, and why if it is not its first time."""
-        self.say(f"[bold]▶ {stage}[/]" + (f" ({jobs} jobs)" if jobs > 1 else "") + (f": {reason}" if reason else ""))
-
-    def stage_finished(self, stage: str, seconds: float) -> None:
-        """Say that a stage is done and clear its bars."""
-        for bar in self._bars.values():
-            self._progress.remove_task(bar)
-        self._bars.clear()
-        self._started.clear()
-        self.say(f"[green]✓[/] {stage}: {_duration(seconds)}")
-
-    def event(self, event: Event) -> None:
-        """Show what an engine reports."""
-        match event:
-            case Event(job, Started()):
-                self._bar(job)
-            case Event(job, JobProgress(done, total, metrics)):
-                self._advance(job, done, total, metrics)
-            case Event(job, Warn(message)):
-                self.say(f"[yellow]! {job}: {message}[/]")
-            case Event(job, AttemptFailed(attempt, reason, will_retry)):
-                then = "trying again" if will_retry else "giving up"
-                self.say(f"[red]✗ {job}: attempt {attempt} failed, {then}: {reason.strip().splitlines()[-1]}[/]")
-            case Event(job, Finished(outcome)):
-                if job in self._bars and outcome == DONE:
-                    self._progress.update(self._bars[job], completed=1, total=1, figures="done")
-            case Event(worker, Replaced(reason)):
-                self.say(f"[yellow]! {worker}: {reason}; started again[/]")
-
-    def _bar(self, job: str) -> Any:
-        if job not in self._bars:
-            self._bars[job] = self._progress.add_task(job, total=None, rate="", figures="")
-        return self._bars[job]
-
-    def _advance(self, job: str, done: int, total: int, metrics: dict[str, float]) -> None:
-        now = time.monotonic()
-        since, first = self._started.setdefault(job, (now, done))
-        rate = f"{(done - first) / (now - since):,.0f}/s" if now - since > 1 and done > first else ""
-        figures = "  ".join(f"{name} {metrics[name]:,.4g}" for name in SHOWN_METRICS if name in metrics)
-        self._progress.update(self._bar(job), completed=done, total=total, rate=rate, figures=figures)
-        if not self._console.is_terminal and now - self._spoken.get(job, now - PLAIN_INTERVAL_S) >= PLAIN_INTERVAL_S:
-            self._spoken[job] = now
-            left = (total - done) * (now - since) / (done - first) if done > first else float("nan")
-            eta = f"  eta {_duration(left)}" if np.isfinite(left) else ""
-            self.say(f"  {job}: {done:,}/{total:,}  {rate}  {figures}{eta}")
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
 
 
 def print_summary(results: RunResults, report: Path) -> None:
@@ -186,13 +57,15 @@ def _summary_rows(results: RunResults) -> Iterator[tuple[str, str]]:
     if "env_steps" in found:
         yield "environment steps", f"{found['env_steps']:,}"
     if "seconds" in found:
-        yield "time", _duration(found["seconds"])
+        yield "time", duration(found["seconds"])
 
 
 def print_status(results: RunResults) -> None:
     """Print where the stages of a run stand, and its results."""
     console = Console()
-    table = Table("stage", "state", "seconds", "sha256 or reason", box=None, padding=(0, 2))
+    table = Table("stage", "state", box=None, padding=(0, 2))
+    table.add_column("seconds", justify="right")
+    table.add_column("sha256 or reason")
     seconds = results.seconds()
     for name, state in results.states.items():
         took = f"{seconds[name]:,.1f}" if name in seconds else ""
