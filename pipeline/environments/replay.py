@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 
 from oodil.pipeline.data import Snapshot
 from oodil.pipeline.environments.batch import StepOutcome
+from oodil.pipeline.environments.pictures import checked, follow
 from oodil.pipeline.errors import UnusableEnvironmentError
 
+STEPS_PER_SECOND = 30
+"""Of a film of an environment that does not say how fast it is."""
 _TRIAL_STEPS = 20
 
 
@@ -63,6 +66,10 @@ class ReplayBatch:
         self._returns = np.zeros(self.num_simulators)
         self._terminated = np.zeros(self.num_simulators, np.bool_)
         self._truncated = np.ones(self.num_simulators, np.bool_)
+        self.steps_per_second = float(environments[0].metadata.get("render_fps") or STEPS_PER_SECOND)
+        for env in environments:
+            if hasattr(env.unwrapped, "mujoco_renderer"):
+                follow(env.unwrapped.mujoco_renderer)
 
     def observations(self) -> NDArray[np.float64]:
         """Return (G, S) observations of the present states, flattened."""
@@ -134,6 +141,15 @@ class ReplayBatch:
                 self.reset(i, seed=int(history[0]))
             for action in history[self._before_actions :].reshape(-1, self.action_dim)[:elapsed]:
                 self._advance(i, action.astype(np.float32))
+
+    def render(self, simulator: int) -> NDArray[np.uint8]:
+        """Return what an environment draws (height, width, 3). Raises TypeError if that is no picture."""
+        return checked(self._environments[simulator].render())
+
+    def close(self) -> None:
+        """Close the environments."""
+        for env in self._environments:
+            env.close()
 
     def _advance(self, simulator: int, action: NDArray[np.float32]) -> float:
         elapsed = int(self._elapsed[simulator])
