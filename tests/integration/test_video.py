@@ -98,7 +98,7 @@ def test_what_cannot_be_written_or_drawn_is_refused(tmp_path: Path) -> None:
         film(Loud(), STRICT, {}, KEY, tmp_path / "film.mp4")
     with pytest.raises(StorageError, match=r"missing/film\.mp4: No such file"):
         film(Loud(), STRICT, {}, KEY, tmp_path / "missing" / "film.mp4")
-    with pytest.raises(UnusableEnvironmentError, match="render.. gave NoneType"):
+    with pytest.raises(UnusableEnvironmentError, match="gave NoneType"):
         film(Loud(), STRICT.replace("Table", "Blind"), {}, KEY, tmp_path / "blind.mp4")
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
@@ -154,13 +154,13 @@ def test_a_film_shows_something_that_moves(tmp_path: Path) -> None:
 
 
 @needs_osmesa
-@pytest.mark.parametrize("environment", ["oodil/HalfCheetah-v0", "oodil/Panda20Hz-v0"])
+@pytest.mark.parametrize("environment", ["oodil/Hopper-v0", "oodil/Panda20Hz-v0"])
 def test_the_robot_is_in_every_frame(environment: str, tmp_path: Path) -> None:
     done = in_a_process("osmesa", "benchmarks/films.py", environment, "--json", str(tmp_path / "films.json"))
     assert done.returncode == 0, done.stderr
     (row,) = json.loads((tmp_path / "films.json").read_text())["rows"]
     assert row["seen_following"] == row["frames"] > 20
-    if environment == "oodil/HalfCheetah-v0":
+    if environment == "oodil/Hopper-v0":
         assert row["seen_still"] < row["frames"] / 2, "a camera that stays would lose it"
 
 
