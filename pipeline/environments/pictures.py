@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Mapping
 from copy import copy
+from functools import lru_cache
 from typing import Any
 
 import mujoco
@@ -31,12 +32,10 @@ class Painter:
 
     def __init__(self, model: mujoco.MjModel, camera: Mapping[str, Any], width: int = 480, height: int = 480) -> None:
         """``camera`` holds attributes of MuJoCo's camera; it follows the robot, see `following`."""
-        from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer
-
         choose_backend()
         self.model = copy(model)
         _endless(self.model)
-        self.viewer: Any = OffScreenViewer(self.model, mujoco.MjData(self.model), width, height)
+        self.viewer: Any = _viewer_class()(self.model, mujoco.MjData(self.model), width, height)
         for costly in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self.viewer.scn.flags[costly] = 0  # Without a graphics card they take two thirds of the time.
         for name, value in following(self.model, camera).items():
@@ -53,6 +52,20 @@ class Painter:
     def close(self) -> None:
         """Free the canvas."""
         self.viewer.close()
+
+
+@lru_cache(maxsize=1)
+def _viewer_class() -> Any:
+    from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer
+
+    class Viewer(OffScreenViewer):
+        """Gymnasium's, without a complaint where there was nothing to draw with and so nothing to free."""
+
+        def free(self) -> None:
+            if hasattr(self, "opengl_context"):
+                super().free()
+
+    return Viewer
 
 
 def _endless(model: mujoco.MjModel) -> None:

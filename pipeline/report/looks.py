@@ -68,9 +68,7 @@ class Look:
     @property
     def text(self) -> str:
         """The color of text on this color: white or black, whichever has the higher contrast."""
-        return max(
-            ("white", "black"), key=lambda text: contrast({"white": "#ffffff", "black": "#000000"}[text], self.color)
-        )
+        return max(("#ffffff", "#000000"), key=lambda text: contrast(text, self.color))
 
 
 def contrast(one: str, other: str) -> float:
