@@ -1,14 +1,13 @@
 """What the policies do: some frames of an episode of ours, and of one that learns from everything alike beside it."""
 
 import base64
-import io
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 
+import imageio.v3 as imageio
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from oodil.pipeline.errors import OodilError
 from oodil.pipeline.filming import open_stage, strip
@@ -17,8 +16,8 @@ from oodil.pipeline.report.summary import Findings
 from oodil.pipeline.seeding import derive_key
 
 NUM_FRAMES = 5
-HEIGHT, QUALITY = 220, 78
-"""Of a frame on the page, in pixels, and as a JPEG: some five kilobytes each."""
+LEAST_HEIGHT, QUALITY = 220, 78
+"""Of a frame on the page, in pixels unless it was drawn smaller, and as a JPEG: some ten kilobytes each."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +64,10 @@ def _film(found: Findings, titles: dict[str, str]) -> Iterator[FilmStrip]:
 
 
 def _address(frame: NDArray[np.uint8]) -> str:
-    image = Image.fromarray(frame)
-    image.thumbnail((2 * HEIGHT, HEIGHT))
-    held = io.BytesIO()
-    image.save(held, "JPEG", quality=QUALITY, optimize=True)
-    return f"data:image/jpeg;base64,{base64.b64encode(held.getvalue()).decode()}"
+    """Return a frame, each pixel the mean of a square of its pixels, as an address."""
+    side = max(1, len(frame) // LEAST_HEIGHT)
+    height, width = (size // side for size in frame.shape[:2])
+    squares = frame[: height * side, : width * side].reshape(height, side, width, side, 3)
+    smaller = squares.mean(axis=(1, 3)).round().astype(np.uint8)
+    encoded = imageio.imwrite("<bytes>", smaller, extension=".jpg", quality=QUALITY)
+    return f"data:image/jpeg;base64,{base64.b64encode(encoded).decode()}"

@@ -12,30 +12,30 @@ PAPER, SOFT = "#ffffff", "#f7f8fa"
 INK, MUTED, LINES, GRID = "#1c2430", "#5f6877", "#7f8896", "#e6e9ee"
 
 # Of sources, clusters and trainings: at least 3 to white paper and to dark paper, so each serves both.
-TRANSFERABLE = ("#2268b7", "#2a9dc8", "#12837a", "#6890e1", "#5c7c9a")
-NOT_TRANSFERABLE = ("#c84a17", "#d07f0e", "#a8553a", "#e86d5c", "#b58a12")
-UNKNOWN = ("#0072b2", "#c28600", "#009e73", "#cb77a6", "#1d99e0", "#c05200", "#5b6879", "#a19400")
-UNMARKED = ("#7c5fa8", "#6b7280", "#a384ca", "#696099")
+TRANSFERABLE = ("#236cbd", "#2999c3", "#12837a", "#648de0", "#5c7c9a")
+NOT_TRANSFERABLE = ("#c84a17", "#ca7b0e", "#a8553a", "#e76654", "#b28812")
+UNKNOWN = ("#0072b2", "#bd8300", "#009e73", "#c971a2", "#1c95db", "#c05200", "#5f6d7e", "#9c9000")
+UNMARKED = ("#7c5fa8", "#6b7280", "#a080c8", "#6d649e")
 """Of sources without a mark, beside some that have one."""
 CLUSTERS = (
     "#2f7d4f",
     "#8458b3",
-    "#8e993a",
+    "#8a9538",
     "#c25a9d",
-    "#715aaa",
-    "#46a46b",
-    "#8c929c",
-    "#b37cd3",
-    "#34725e",
-    "#816141",
+    "#755fad",
+    "#449f68",
+    "#888e98",
+    "#b077d1",
+    "#367762",
+    "#866544",
 )
 POLICIES = (INK, MUTED, "#1f5fa8", "#8458b3", "#a3461c", "#12736b", "#8c6d1f", "#a03a72")
 """Colors of learning curves, ours first. Curves are named in their colors, so each has a contrast of 4.5."""
-TRAINING = ("#12756d", "#8458b3")
+TRAINING = ("#12786f", "#8458b3")
 """Colors of a discriminator's accuracy on demonstrations and on the policy's transitions."""
 DARK = {
     PAPER: "#12161c",
-    SOFT: "#1a2029",
+    SOFT: "#171c24",
     INK: "#e8ebf0",
     MUTED: "#a4adbb",
     LINES: "#727c8b",

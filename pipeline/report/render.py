@@ -351,7 +351,7 @@ def _stages(results: RunResults) -> list[StageRow]:
             time=formats.duration(seconds[name]) if name in seconds else formats.UNKNOWN,
             env_steps=f"{env_steps[name]:,}" if name in env_steps else formats.UNKNOWN,
             sha256=state.artifact.sha256[:12] if state.artifact else "",
-            state=f"{state.state}: {state.reason}" if state.reason else state.state,
+            state=f"{state.state}: {summary.reason_of(results, name)}" if state.reason else state.state,
         )
         for name, state in results.states.items()
     ]

@@ -234,6 +234,10 @@ def _unusable(results: RunResults) -> list[Note]:
     stages_with: dict[str, list[str]] = {}
     for name, state in results.states.items():
         if state.state != "done":
-            reason = state.reason.replace(f"{results.path}/", "")
-            stages_with.setdefault(STATES[state.state].format(reason), []).append(name)
+            stages_with.setdefault(STATES[state.state].format(reason_of(results, name)), []).append(name)
     return [Note(f", {reason}.", f"Missing: {', '.join(stages)}") for reason, stages in stages_with.items()]
+
+
+def reason_of(results: RunResults, stage: str) -> str:
+    """Return why a stage cannot be used, with files named from the run's folder on."""
+    return results.states[stage].reason.replace(f"{results.path}/", "")

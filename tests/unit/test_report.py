@@ -580,7 +580,7 @@ def test_without_marks_the_cards_show_what_is_known(tmp_path: Path) -> None:
 
 def test_nothing_tells_where_the_author_keeps_files(tmp_path: Path) -> None:
     run = new_run(tmp_path, SMALL["marks"], SMALL["counts"])
-    values = run.config.model_dump(mode="json")
+    values = run.config.model_dump(mode="json") | {"baselines": []}
     values["demonstrations"] = {"file": str(tmp_path / "mine.safetensors")}
     page = render(Run(parse_config(values, origin="test"), run.directory))
     assert "mine.safetensors" in page.text and str(tmp_path) not in page.text
