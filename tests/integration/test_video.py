@@ -115,6 +115,8 @@ def test_a_film_that_cannot_be_written_ends_with_exit_code_2(tmp_path: Path) -> 
     done = CliRunner().invoke(app, evaluate)
     assert done.exit_code == 0, done.output
     assert imageio.imread(tmp_path / "run" / "imitation.mp4").shape == (13, 32, 48, 3)
+    page = oodil.write_report(oodil.open_run(tmp_path / "run")).read_text()
+    assert page.count("data:image/jpeg;base64,") == 5 and "No film" not in page
     (tmp_path / "run" / "imitation.mp4").unlink()
     (tmp_path / "run" / "imitation.mp4").mkdir()
     refused = CliRunner().invoke(app, evaluate)
