@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodil.pipeline.data import Snapshot
-
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-"""All that MuJoCo's next step depends on. `mjSTATE_FULLPHYSICS` is not: it leaves out the solver's warm start."""
+from oodil.pipeline.environments.pictures import STATE, Painter
 
 
 @dataclass(frozen=True)
@@ -66,6 +64,19 @@ class Simulators(Protocol):
         """Continue from a snapshot of a batch of the same size and task."""
 
 
+class VisibleSimulators(Simulators, Protocol):
+    """Simulators that can be looked at: all that `make_batch` makes, with Gymnasium's render_mode "rgb_array"."""
+
+    steps_per_second: float
+    """Of simulated time."""
+
+    def render(self, simulator: int) -> NDArray[np.uint8]:
+        """Return a picture (height, width, 3) of one simulator."""
+
+    def close(self) -> None:
+        """Free what pictures took."""
+
+
 def stop_the_clock() -> None:
     """Keep MuJoCo from timing itself: reading the clock for ``MjData.timer`` is a sixth of a step of Hopper.
 
@@ -79,6 +90,7 @@ class MujocoBatch(ABC):
     """G simulators of one compiled model, stepped at the speed of raw ``mj_step``; a `Simulators`."""
 
     observation_dim: int
+    steps_per_second: float
 
     def __init__(self, model: mujoco.MjModel, num_simulators: int, max_episode_steps: int) -> None:
         self.model = model
@@ -88,6 +100,7 @@ class MujocoBatch(ABC):
         self._data = [mujoco.MjData(model) for _ in range(num_simulators)]
         self._elapsed = np.zeros(num_simulators, np.int64)
         self._returns = np.zeros(num_simulators)
+        self._painter: Painter | None = None
 
     @abstractmethod
     def observations(self) -> NDArray[np.float64]:
@@ -112,6 +125,10 @@ class MujocoBatch(ABC):
     @abstractmethod
     def _read(self, simulator: int) -> None:
         """Take over what is observed of a simulator that was put somewhere else."""
+
+    @abstractmethod
+    def _new_painter(self) -> Painter:
+        """Return what draws pictures of the simulators."""
 
     def reset(self, simulator: int, seed: int) -> None:
         """Start a new episode in one simulator, as ``gymnasium.make(...).reset(seed=seed)`` would."""
@@ -155,3 +172,20 @@ class MujocoBatch(ABC):
             self._read(i)
         self._elapsed[:] = snapshot.elapsed_steps
         self._returns[:] = snapshot.episode_returns
+
+    def render(self, simulator: int) -> NDArray[np.uint8]:
+        """Return a picture (height, width, 3) of one simulator."""
+        return self.painter.paint(self._data[simulator])
+
+    @property
+    def painter(self) -> Painter:
+        """What draws pictures of the simulators."""
+        if self._painter is None:
+            self._painter = self._new_painter()
+        return self._painter
+
+    def close(self) -> None:
+        """Free what pictures took."""
+        if self._painter is not None:
+            self._painter.close()
+            self._painter = None

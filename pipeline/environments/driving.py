@@ -145,12 +145,9 @@ class DrivingEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Put a new car on the start line."""
         super().reset(seed=seed)
-        from highway_env.vehicle.objects import Landmark, Obstacle
-
         x, y, heading = draw_start(self.np_random)
         self._car = _car_class()(None, (x, y), heading, self.layout.speed)
-        self._obstacles = [_resized(Obstacle(None, (box.x, box.y)), box) for box in self.layout.obstacles]
-        self._goal = _resized(Landmark(None, (GOAL.x, GOAL.y)), GOAL)
+        self._obstacles, self._goal = _things(self.layout)
         return self._observation(), {}
 
     def step(self, action: NDArray[np.floating]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
@@ -170,22 +167,8 @@ class DrivingEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
 
     def render(self) -> NDArray[np.uint8]:
         """Return the world as seen from above (height, width, 3)."""
-        import pygame
-        from highway_env.road.graphics import RoadObjectGraphics, WorldSurface
-        from highway_env.vehicle.graphics import VehicleGraphics
-
-        scale = 10
-        size = (int(WIDTH * scale), int(HEIGHT * scale))
-        surface = WorldSurface(size, 0, pygame.Surface(size))
-        surface.scaling = scale
-        surface.fill(WorldSurface.GREY)
-        RoadObjectGraphics.display(self._goal, surface, offscreen=True)
-        for obstacle in self._obstacles:
-            RoadObjectGraphics.display(obstacle, surface, offscreen=True)
-        self._car.color = VehicleGraphics.EGO_COLOR
-        VehicleGraphics.display(self._car, surface, offscreen=True)
-        # Pygame's y points down, ours ahead.
-        return np.ascontiguousarray(np.flip(pygame.surfarray.array3d(surface).transpose(1, 0, 2), axis=0))
+        x, y = self._car.position
+        return draw(self.layout, x, y, self._car.heading)
 
     def batched(self, num_simulators: int, max_episode_steps: int) -> "DrivingBatch":
         """Return many cars in this world."""
@@ -204,6 +187,35 @@ def _car_class() -> Any:
     return type("Car", (Vehicle,), {"LENGTH": CAR_LENGTH, "WIDTH": CAR_WIDTH})
 
 
+def _things(world: Layout) -> tuple[list[Any], Any]:
+    """Return the obstacles and the finish strip as highway-env has them."""
+    from highway_env.vehicle.objects import Landmark, Obstacle
+
+    obstacles = [_resized(Obstacle(None, (box.x, box.y)), box) for box in world.obstacles]
+    return obstacles, _resized(Landmark(None, (GOAL.x, GOAL.y)), GOAL)
+
+
+def draw(world: Layout, x: float, y: float, heading: float) -> NDArray[np.uint8]:
+    """Return the world with a car as seen from above (height, width, 3)."""
+    import pygame
+    from highway_env.road.graphics import RoadObjectGraphics, WorldSurface
+    from highway_env.vehicle.graphics import VehicleGraphics
+
+    scale = 10
+    size = (int(WIDTH * scale), int(HEIGHT * scale))
+    surface = WorldSurface(size, 0, pygame.Surface(size))
+    surface.scaling = scale
+    surface.fill(WorldSurface.GREY)
+    obstacles, goal = _things(world)
+    for thing in (goal, *obstacles):
+        RoadObjectGraphics.display(thing, surface, offscreen=True)
+    car = _car_class()(None, (x, y), heading, world.speed)
+    car.color = VehicleGraphics.EGO_COLOR
+    VehicleGraphics.display(car, surface, offscreen=True)
+    # Pygame's y points down, ours ahead.
+    return np.ascontiguousarray(np.flip(pygame.surfarray.array3d(surface).transpose(1, 0, 2), axis=0))
+
+
 def _resized(thing: Any, box: Box) -> Any:
     thing.LENGTH, thing.WIDTH = box.width, box.depth
     thing.diagonal = np.hypot(box.width, box.depth)
@@ -215,6 +227,7 @@ class DrivingBatch:
 
     observation_dim = 5
     action_dim = 1
+    steps_per_second = 1 / TIME_STEP
 
     def __init__(self, world: Layout, num_simulators: int, max_episode_steps: int) -> None:
         self.layout = world
@@ -288,6 +301,13 @@ class DrivingBatch:
         self._x[:], self._y[:], self._heading[:] = snapshot.states.T
         self._elapsed[:] = snapshot.elapsed_steps
         self._returns[:] = snapshot.episode_returns
+
+    def render(self, simulator: int) -> NDArray[np.uint8]:
+        """Return the world of one car as seen from above (height, width, 3)."""
+        return draw(self.layout, self._x[simulator], self._y[simulator], self._heading[simulator])
+
+    def close(self) -> None:
+        """Nothing is held."""
 
 
 @dataclass(frozen=True)

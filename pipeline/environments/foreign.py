@@ -14,9 +14,12 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from oodil.pipeline.environments.pictures import checked, follow
 from oodil.pipeline.errors import UnusableEnvironmentError
 from oodil.pipeline.policy import action_units
 
+STEPS_PER_SECOND = 30
+"""Of a film of an environment that does not say how fast it is."""
 LONGEST_OBSERVATION = 1_000
 """Numbers that are observed; more are an image or the like, which small networks do not learn from."""
 _LARGEST = float(np.finfo(np.float32).max)
@@ -92,6 +95,9 @@ class ForeignEnvironment:
         self.observation_dim = int(np.prod(self._seen.shape))
         self.action_dim = int(np.prod(self._space.shape))
         self.can_be_placed = can_be_placed(env)
+        self.steps_per_second = float(env.metadata.get("render_fps") or STEPS_PER_SECOND)
+        if hasattr(env.unwrapped, "mujoco_renderer"):
+            follow(env.unwrapped.mujoco_renderer)
         # A row is a seed, a mark of what was seen at first, and an action and a mark of what it led to for each step.
         # One that can be placed has room in between for where it was placed; its seed is -1 then.
         self._before_steps = 2 + self.observation_dim * self.can_be_placed
@@ -168,6 +174,10 @@ class ForeignEnvironment:
             self.step(step[:-1].astype(np.float32))
             end = self._before_steps + self.elapsed * (self.action_dim + 1)
             self._refuse_other(step[-1], self._row[end - 1], elapsed)
+
+    def render(self) -> NDArray[np.uint8]:
+        """Return what it draws (height, width, 3). Raises TypeError if that is no picture."""
+        return checked(self._env.render())
 
     def close(self) -> None:
         """Let go of what it holds; one that fails to do so is let go of anyway."""

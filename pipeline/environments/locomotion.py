@@ -6,6 +6,7 @@ for a whole batch, and how it draws the initial velocity. The batch agrees to th
 environment per simulator.
 """
 
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import mujoco
@@ -15,6 +16,7 @@ from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
 from oodil.pipeline.environments.batch import MujocoBatch, StepOutcome
+from oodil.pipeline.environments.pictures import Painter, follow
 
 Floats = NDArray[np.float64]
 
@@ -27,6 +29,8 @@ class Task(Protocol):
     init_qpos: Floats
     velocity_limit: float
     """Velocities are clipped to it in the observation."""
+    camera: Mapping[str, Any]
+    """Attributes of the camera that draws pictures."""
     _reset_noise_scale: float
     _forward_reward_weight: float
     _ctrl_cost_weight: float
@@ -64,11 +68,13 @@ class HopperEnv(hopper_v5.HopperEnv):
     """Hopper-v5 with root x in the observation and a chosen ``gravity`` in m/s^2 (positive, downwards)."""
 
     velocity_limit = 10.0
+    camera: Mapping[str, Any] = hopper_v5.DEFAULT_CAMERA_CONFIG
 
     def __init__(self, gravity: float = 9.81, **kwargs: Any) -> None:
         if not 0 < gravity < np.inf:
             raise ValueError(f"gravity is {gravity}; it must be positive and finite (m/s^2, downwards)")
         super().__init__(exclude_current_positions_from_observation=False, **kwargs)
+        follow(self.mujoco_renderer)
         self.model.opt.gravity[2] = -gravity
 
     def healthy_bounds(self) -> tuple[Floats, Floats]:
@@ -96,11 +102,13 @@ class Walker2dEnv(walker2d_v5.Walker2dEnv):
     """
 
     velocity_limit = 10.0
+    camera: Mapping[str, Any] = walker2d_v5.DEFAULT_CAMERA_CONFIG
 
     def __init__(self, friction: float = 1.9, **kwargs: Any) -> None:
         if not 0 < friction < np.inf:
             raise ValueError(f"friction is {friction}; it must be positive and finite")
         super().__init__(exclude_current_positions_from_observation=False, **kwargs)
+        follow(self.mujoco_renderer)
         for foot in ("foot_geom", "foot_left_geom"):
             self.model.geom(foot).friction[0] = friction
             self.model.geom(foot).priority[0] = 1
@@ -125,6 +133,7 @@ class HalfCheetahEnv(half_cheetah_v5.HalfCheetahEnv):
     """
 
     velocity_limit = np.inf
+    camera: Mapping[str, Any] = half_cheetah_v5.DEFAULT_CAMERA_CONFIG
     _healthy_reward = 0.0
     _terminate_when_unhealthy = False
 
@@ -132,6 +141,7 @@ class HalfCheetahEnv(half_cheetah_v5.HalfCheetahEnv):
         if not (0 <= front < np.inf and 0 <= back < np.inf):
             raise ValueError(f"front and back are {front} and {back}; a motor's scale must be finite and not negative")
         super().__init__(exclude_current_positions_from_observation=False, **kwargs)
+        follow(self.mujoco_renderer)
         for actuator in range(self.model.nu):
             name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator)
             self.model.actuator_gear[actuator, 0] *= front if name.startswith("f") else back
@@ -157,6 +167,7 @@ class LocomotionBatch(MujocoBatch):
         # A robot is one kinematic tree, so to look for islands of constraints, every time, finds nothing.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
         self.task = task
+        self.steps_per_second = 1 / task.dt
         # Views into MuJoCo's memory, fetched once: every attribute access on MjData costs as much as a copy.
         self._controls = [data.ctrl for data in self._data]
         self._positions = [data.qpos for data in self._data]
@@ -219,3 +230,6 @@ class LocomotionBatch(MujocoBatch):
     def _read(self, simulator: int) -> None:
         self._qpos[simulator] = self._positions[simulator]
         self._qvel[simulator] = self._velocities[simulator]
+
+    def _new_painter(self) -> Painter:
+        return Painter(self.model, self.task.camera)

@@ -18,6 +18,7 @@ from gymnasium.utils.seeding import np_random
 from numpy.typing import ArrayLike, NDArray
 
 from oodil.pipeline.environments.batch import MujocoBatch, StepOutcome
+from oodil.pipeline.environments.pictures import Painter
 
 Floats = NDArray[np.float64]
 
@@ -37,6 +38,7 @@ PLACED_FROM, PLACED_WITHIN, PLACED_STEPS = 6, 1e-6, 300
 SUCCESS_REWARD, FAILURE_REWARD = 1000.0, -1000.0
 SERVO = 1000.0
 """N m s / rad. The wanted velocity is the distance to the wanted angle, per second, so this is the stiffness, too."""
+CAMERA = {"lookat": np.array((0.4, 0.0, 0.25)), "distance": 1.8, "azimuth": 120, "elevation": -20}
 _SITE, _BOX_JOINT, _ARM = "gripper0_grip_site", "box_joint0", ("robot0_", "gripper0_")
 
 
@@ -183,7 +185,7 @@ class PandaEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(self.arm.working),), np.float32)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (6,), np.float64)
         self._data = mujoco.MjData(self.arm.model)
-        self._renderer: mujoco.Renderer | None = None
+        self._painter: Painter | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Put the box on the table and the hand before it."""
@@ -201,20 +203,15 @@ class PandaEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
 
     def render(self) -> NDArray[np.uint8]:
         """Return the scene from the side (height, width, 3)."""
-        if self._renderer is None:
-            self._renderer = mujoco.Renderer(self.arm.model, 480, 640)
-        camera = mujoco.MjvCamera()
-        camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (0.4, 0.0, 0.25), 1.8, 120, -20
-        shown = mujoco.MjvOption()
-        # robosuite keeps what collides in group 0, what is looked at in group 1, and marks in sites.
-        shown.geomgroup[0], shown.sitegroup[:] = 0, 0
-        self._renderer.update_scene(self._data, camera, shown)
-        return self._renderer.render()
+        if self._painter is None:
+            self._painter = _new_painter(self.arm.model)
+        return self._painter.paint(self._data)
 
     def close(self) -> None:
         """Free what rendering took."""
-        if self._renderer is not None:
-            self._renderer.close()
+        if self._painter is not None:
+            self._painter.close()
+            self._painter = None
 
     def batched(self, num_simulators: int, max_episode_steps: int) -> "PandaBatch":
         """Return many such arms."""
@@ -229,6 +226,7 @@ class PandaBatch(MujocoBatch):
     def __init__(self, arm: Arm, num_simulators: int, max_episode_steps: int) -> None:
         super().__init__(arm.model, num_simulators, max_episode_steps)
         self.arm = arm
+        self.steps_per_second = 1 / (TIME_STEP * arm.frame_skip)
         self._observations = np.zeros((num_simulators, 6))
 
     def observations(self) -> Floats:
@@ -269,6 +267,9 @@ class PandaBatch(MujocoBatch):
         mujoco.mj_kinematics(self.model, data)
         self._observations[simulator] = self.arm.observe(data)
 
+    def _new_painter(self) -> Painter:
+        return _new_painter(self.model)
+
 
 class Pusher:
     """The hand-written demonstrator: bring the hand behind the box, to the height of its push, and then into it.
@@ -307,6 +308,13 @@ class Pusher:
         solved = np.linalg.solve(jacobian @ jacobian.T + self.DAMPING * np.eye(3), self.CARE * velocity)
         # The servos turn a joint by its distance to the wanted angle, per second.
         return np.clip((angles + jacobian.T @ solved - wanted) / self._control_step, -1, 1)
+
+
+def _new_painter(model: mujoco.MjModel) -> Painter:
+    painter = Painter(model, CAMERA, width=640)
+    # robosuite keeps what collides in group 0, what is looked at in group 1, and marks in sites.
+    painter.viewer.vopt.geomgroup[0], painter.viewer.vopt.sitegroup[:] = 0, 0
+    return painter
 
 
 def _joint_name(number: int) -> str:

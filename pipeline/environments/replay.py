@@ -40,6 +40,7 @@ class ReplayBatch:
         self.max_episode_steps = max_episode_steps
         self.observation_dim = environments[0].observation_dim
         self.action_dim = environments[0].action_dim
+        self.steps_per_second = environments[0].steps_per_second
         self._episodes = 0
 
     def observations(self) -> NDArray[np.float64]:
@@ -98,6 +99,15 @@ class ReplayBatch:
         for environment, history, elapsed in rows:
             if not environment.stands_at(history, elapsed):
                 environment.replay(history, elapsed)
+
+    def render(self, simulator: int) -> NDArray[np.uint8]:
+        """Return what an environment draws (height, width, 3). Raises TypeError if that is no picture."""
+        return self._environments[simulator].render()
+
+    def close(self) -> None:
+        """Close the environments."""
+        for environment in self._environments:
+            environment.close()
 
     def _truncated(self) -> NDArray[np.bool_]:
         return np.array([each.truncated or each.elapsed >= self.max_episode_steps for each in self._environments])

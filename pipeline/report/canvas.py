@@ -18,7 +18,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from oodil.pipeline.report.formats import count
-from oodil.pipeline.report.looks import GRID, INK, MUTED
+from oodil.pipeline.report.looks import GRID, INK, LINES, MUTED, on_any_paper
 
 MOST_AS_VECTORS = 3000
 """With more demonstrations, dots become a bitmap inside the SVG; as vectors they would take megabytes."""
@@ -28,7 +28,7 @@ STYLE: dict[str, Any] = {
     "font.size": 8.5,
     "text.color": INK,
     "text.parse_math": False,
-    "axes.edgecolor": "#b9c0ca",
+    "axes.edgecolor": LINES,
     "axes.labelcolor": MUTED,
     "axes.labelpad": 7,
     "axes.titlesize": 9,
@@ -42,8 +42,8 @@ STYLE: dict[str, Any] = {
     "axes.axisbelow": True,
     "grid.color": GRID,
     "grid.linewidth": 0.8,
-    "xtick.color": "#b9c0ca",
-    "ytick.color": "#b9c0ca",
+    "xtick.color": LINES,
+    "ytick.color": LINES,
     "xtick.labelcolor": MUTED,
     "ytick.labelcolor": MUTED,
     "xtick.major.size": 3,
@@ -95,4 +95,4 @@ def drawing(name: str, width: float, height: float) -> Iterator[tuple[Figure, io
     element = drawn.getvalue()
     element = re.sub(r"<metadata>.*?</metadata>", "", element[element.index("<svg") :], flags=re.DOTALL)
     # Identifiers of groups (axes_1, ...) repeat in every figure, and nothing refers to them.
-    svg.write(re.sub(r'(<g) id="[^"]*"', r"\1", element).strip())
+    svg.write(on_any_paper(re.sub(r'(<g) id="[^"]*"', r"\1", element).strip()))

@@ -17,7 +17,7 @@ from sklearn.manifold import TSNE
 from threadpoolctl import threadpool_limits
 
 from oodil.pipeline.report.canvas import dots, drawing, largest_first, steps_axis, tick
-from oodil.pipeline.report.looks import CLUSTERS, INK, MUTED, POLICIES, TRAINING, Look
+from oodil.pipeline.report.looks import CLUSTERS, INK, MUTED, POLICIES, SOFT, TRAINING, Look
 from oodil.pipeline.results import Evaluation, LearningCurve
 
 DASHES = ("solid", "solid", (0, (5, 3)), (0, (1, 1.5)))
@@ -80,7 +80,7 @@ def embedding(
             axes.set_title(title)
             axes.set(xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
-            axes.set_facecolor("#f7f8fa")
+            axes.set_facecolor(SOFT)
             axes.margins(0.06, 0.1)
         for k in np.unique(clusters):
             member = points[clusters == k]

@@ -24,6 +24,8 @@ from oodil.pipeline.report.looks import MUTED, NOT_TRANSFERABLE, TRANSFERABLE, L
 
 SHADES = LinearSegmentedColormap.from_list("shades", ("#d5dbe2", "#6f9bd1", "#0b2a5b"))
 """From weightless to the heaviest."""
+LIGHT = "#fdfdfd"
+"""Stays light on dark paper, as the shades need it."""
 MOST_COLUMNS = 4
 
 
@@ -69,7 +71,7 @@ def paths(demonstrations: Demonstrations, weights: NDArray[np.float64], looks: l
 
 def _plane(axes: Axes, world: Layout) -> None:
     """Draw the border, the strip to be reached and the obstacles."""
-    axes.set(xlim=(0, WIDTH), ylim=(0, HEIGHT), aspect="equal", xticks=[], yticks=[], facecolor="white")
+    axes.set(xlim=(0, WIDTH), ylim=(0, HEIGHT), aspect="equal", xticks=[], yticks=[], facecolor=LIGHT)
     axes.grid(False)
     axes.spines[:].set_visible(True)
     axes.spines[:].set_color(MUTED)

@@ -6,6 +6,8 @@ Letters: N demonstrations, K clusters.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 import jinja2
 import numpy as np
@@ -14,7 +16,9 @@ from markupsafe import Markup
 
 from oodil.pipeline.algorithms.weights import effective_number
 from oodil.pipeline.report import figures, formats, looks, paths, score_figures, summary
+from oodil.pipeline.report.films import FilmSection, read_films
 from oodil.pipeline.report.policies import PolicySection, read_policies
+from oodil.pipeline.report.ranks import RankRow, best_and_worst
 from oodil.pipeline.report.sources import Source, Sources
 from oodil.pipeline.report.summary import Card, Findings, Note
 from oodil.pipeline.report.trainings import read_trainings
@@ -35,6 +39,8 @@ class WeightingSection:
     figure: Markup
     by_source: tuple[tuple[Source, Verdicts], ...]
     by_cluster: tuple[Verdicts, ...]
+    ranks: tuple[RankRow, ...]
+    """The best and the worst demonstrations."""
     threshold: float
     effective_number: float
     alternatives: tuple[tuple[str, float, float], ...]
@@ -120,7 +126,7 @@ class StageRow:
     time: str
     env_steps: str
     sha256: str
-    """Of the artifact; empty unless it can be used."""
+    """The first digits of the artifact's; empty unless it can be used."""
     state: str
     """With its reason."""
 
@@ -137,6 +143,7 @@ class Report:
     finding: str
     cards: tuple[Card, ...]
     notes: tuple[Note, ...]
+    films: FilmSection | None
     policies: PolicySection | None
     weightings: tuple[WeightingSection, ...]
     mixture: Mixture | None
@@ -170,6 +177,7 @@ def context(results: RunResults) -> Report:
         finding=summary.finding(found),
         cards=tuple(summary.cards(found)),
         notes=tuple(summary.notes(found)),
+        films=read_films(found),
         policies=read_policies(found),
         weightings=tuple(_weighting(found, sources, name) for name in found.ranking) if sources else (),
         mixture=_mixture(found, sources) if sources and found.weightings else None,
@@ -184,8 +192,17 @@ def context(results: RunResults) -> Report:
         ),
         stages=tuple(_stages(results)),
         versions=_versions(results),
-        config=yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True),
+        config=yaml.safe_dump(_portable(config.model_dump(mode="json")), sort_keys=False, allow_unicode=True),
     )
+
+
+def _portable(value: Any) -> Any:
+    """Return a configuration with names in place of absolute paths, which say nothing elsewhere."""
+    if isinstance(value, dict):
+        return {key: _portable(held) for key, held in value.items()}
+    if isinstance(value, list):
+        return [_portable(held) for held in value]
+    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
 
 
 @cache
@@ -199,7 +216,8 @@ def _environment() -> jinja2.Environment:
     )
     environment.filters |= {each.__name__: each for each in (formats.plural, formats.returned, formats.percent)}
     environment.filters["steps"] = formats.count
-    environment.globals["training_colors"] = looks.TRAINING
+    environment.filters["on_any_paper"] = lambda text: Markup(looks.on_any_paper(str(text)))
+    environment.globals |= {"training_colors": looks.TRAINING, "dark": looks.DARK}
     return environment
 
 
@@ -216,6 +234,7 @@ def _weighting(found: Findings, sources: Sources, name: str) -> WeightingSection
         rule=found.rule(name),
         by_source=tuple(zip((each for each in sources.each if each.count), table.by_source, strict=True)),
         by_cluster=table.by_cluster,
+        ranks=best_and_worst(weighting, sources),
         threshold=table.threshold,
         effective_number=table.effective_number,
         alternatives=_alternatives(weighting, found.separation.get(name, {})),
@@ -333,8 +352,8 @@ def _stages(results: RunResults) -> list[StageRow]:
             name=name,
             time=formats.duration(seconds[name]) if name in seconds else formats.UNKNOWN,
             env_steps=f"{env_steps[name]:,}" if name in env_steps else formats.UNKNOWN,
-            sha256=state.artifact.sha256 if state.artifact else "",
-            state=f"{state.state}: {state.reason}" if state.reason else state.state,
+            sha256=state.artifact.sha256[:12] if state.artifact else "",
+            state=f"{state.state}: {summary.reason_of(results, name)}" if state.reason else state.state,
         )
         for name, state in results.states.items()
     ]

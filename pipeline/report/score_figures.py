@@ -14,10 +14,10 @@ from oodil.pipeline.results import Transferability
 
 MOST_COUNTED, MOST_NAMED = 11, 30
 """With more columns in all, there is no room for their counts, and then none for the numbers of clusters."""
-LEAST_SIZE = 22
-"""Of a mark that is kept or open: in a crowded column, few of them would be lost."""
-FILLS = {"not kept": (0.35, True), "open": (1.0, False), "kept": (1.0, True)}
-"""By verdict, how opaque a mark is and whether it is filled; in the order of drawing."""
+LEAST_SIZE, SMALL = 22, 8
+"""Of a mark that is kept or open: in a crowded column, few of them would be lost; and of one that is not kept."""
+FILLED = {"not kept": True, "open": False, "kept": True}
+"""By verdict, whether a mark is filled; in the order of drawing."""
 
 
 def transferability(found: Transferability, sources: NDArray[np.int32], looks: list[Look]) -> Markup:
@@ -76,10 +76,10 @@ def _columns(
     axes.set_xlim(-0.55, len(present) - 0.45)
     axes.tick_params(axis="x", length=0)
     lines = np.minimum(1.2, size / 20)
-    size[verdicts != "not kept"] = np.maximum(size[verdicts != "not kept"], LEAST_SIZE)
+    size = np.where(verdicts == "not kept", np.minimum(size, SMALL), np.maximum(size, LEAST_SIZE))
     bitmap = len(groups) > MOST_AS_VECTORS
     for i in largest_first(sources):
-        for verdict, (alpha, filled) in FILLS.items():
+        for verdict, filled in FILLED.items():
             mine = (sources == i) & (verdicts == verdict)
             color, marker = looks[i].color, looks[i].marker
             low, high = found.intervals[mine].T
@@ -93,7 +93,7 @@ def _columns(
                 rasterized=bitmap,
             )
             axes.scatter(
-                x[mine], found.scores[mine], s=size[mine], marker=marker, zorder=3, alpha=alpha, rasterized=bitmap,
+                x[mine], found.scores[mine], s=size[mine], marker=marker, zorder=3, rasterized=bitmap,
                 facecolors=color if filled else "white", edgecolors="white" if filled else color,
                 linewidths=0.35 if filled else 1.2,
             )  # fmt: skip

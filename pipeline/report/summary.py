@@ -10,6 +10,8 @@ from oodil.pipeline.report.sources import Sources, ranks_demonstrations, read_so
 from oodil.pipeline.results import ClusterDiagnostics, Evaluation, Transferability
 from oodil.pipeline.runs import RunResults
 
+MOST_NAMED = 6
+"""Sources in the finding."""
 FEW_EPISODES = 20
 """A mean return over fewer episodes is called rough."""
 UNSTABLE_LABELS = 0.9
@@ -96,7 +98,25 @@ class Findings:
 
 
 def finding(found: Findings) -> str:
-    """Return the main result in one sentence: our return beside those of the other policies."""
+    """Return what the run found, in two sentences: what is kept, and our return beside those of the other policies."""
+    return " ".join(filter(None, (_kept(found), _compared(found))))
+
+
+def _kept(found: Findings) -> str:
+    """Say how many demonstrations the first weighting that ranks them keeps, and of which sources."""
+    if not found.ranking or not found.sources:
+        return ""
+    rows = found.results.verdicts(found.ranking[0]).by_source
+    total, kept = sum(row.demonstrations for row in rows), sum(row.kept for row in rows)
+    told = f"{kept:,} of {formats.plural(total, 'demonstration')} {'is' if kept == 1 else 'are'} kept"
+    named = [f"{row.kept:,} of {row.demonstrations:,} of {row.name}" for row in rows if row.kept]
+    if len(rows) == 1 or not named:
+        return f"{told}."
+    shown = f"{', '.join(named[:MOST_NAMED])}{', …' if len(named) > MOST_NAMED else ''}"
+    return f"{told}: {shown}{'; none of the others' if len(named) < len(rows) else ''}."
+
+
+def _compared(found: Findings) -> str:
     means = {name: final.mean_return for name, final in found.finals.items() if np.isfinite(final.mean_return)}
     first = found.results.policies[0]
     if first.name not in means:
@@ -126,6 +146,7 @@ def cards(found: Findings) -> list[Card]:
         shown.append(
             Card(f"Final return, {policy.title}", formats.returned(final.mean_return if final else None), note)
         )
+    shown += [_kept_card(found, name) for name in found.ranking]
     for name, figures in found.separation.items():
         of = f", {found.title(name)}" if len(found.separation) > 1 else ""
         share, unsharpened = formats.percent(figures["share"]), formats.percent(figures["share_power_1"])
@@ -136,12 +157,26 @@ def cards(found: Findings) -> list[Card]:
         note = "1 if all transferable demonstrations rank above all others"
         shown.append(Card(f"AUROC{of}", formats.decimal(figures["auroc"]), note))
     in_use = f"{diagnostics.non_empty_clusters} of {diagnostics.num_clusters} clusters in use" if diagnostics else ""
-    shown.append(Card("Purity of clusters", formats.decimal(diagnostics.purity if diagnostics else None), in_use))
+    if diagnostics and diagnostics.purity is not None:
+        shown.append(Card("Purity of clusters", formats.decimal(diagnostics.purity), in_use))
+    elif diagnostics:
+        stability = f"{formats.percent(diagnostics.label_stability)} of their labels survive another draw"
+        shown.append(Card("Clusters", f"{diagnostics.non_empty_clusters}", f"{in_use}; {stability}"))
     steps = formats.count(env_steps) if env_steps else formats.UNKNOWN
     shown.append(Card("Environment steps", steps, "in all trainings"))
     time = formats.duration(seconds) if seconds else formats.UNKNOWN
     shown.append(Card("Time", time, "of all finished stages"))
     return shown
+
+
+def _kept_card(found: Findings, weighting: str) -> Card:
+    """Return how many demonstrations are kept, which a run without marks knows as well."""
+    table = found.results.verdicts(weighting)
+    rows = table.by_source
+    total, kept, undecided = (sum(getattr(row, field) for row in rows) for field in ("demonstrations", "kept", "open"))
+    note = f"of {total:,}; {undecided:,} open; as even as {table.effective_number:.0f} of equal weight"
+    of = f", {found.title(weighting)}" if len(found.ranking) > 1 else ""
+    return Card(f"Demonstrations kept{of}", f"{kept:,}", note)
 
 
 def _spread(final: Evaluation) -> str:
@@ -199,5 +234,10 @@ def _unusable(results: RunResults) -> list[Note]:
     stages_with: dict[str, list[str]] = {}
     for name, state in results.states.items():
         if state.state != "done":
-            stages_with.setdefault(STATES[state.state].format(state.reason), []).append(name)
+            stages_with.setdefault(STATES[state.state].format(reason_of(results, name)), []).append(name)
     return [Note(f", {reason}.", f"Missing: {', '.join(stages)}") for reason, stages in stages_with.items()]
+
+
+def reason_of(results: RunResults, stage: str) -> str:
+    """Return why a stage cannot be used, with files named from the run's folder on."""
+    return results.states[stage].reason.replace(f"{results.path}/", "")

@@ -4,6 +4,7 @@ import os
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -67,7 +68,7 @@ def run_cost(run: Run, chosen: Sequence[Stage], workers: int | None, force: Coll
     return RunCost(costs, 1 / step_s, workers)
 
 
-def step_seconds(env_id: str, dynamics: Mapping[str, float], count: int) -> float:
+def step_seconds(env_id: str, dynamics: Mapping[str, Any], count: int) -> float:
     """Return how long a step of an environment takes on one core, by so many simulators under random actions."""
     simulators = make_batch(env_id, dynamics, count)
     rng = np.random.default_rng(0)

@@ -27,22 +27,28 @@ def evaluate(
     """Evaluate trained policies on the true return of the imitator's environment."""
     from oodil.api import evaluate as evaluate_policy
     from oodil.api import open_run
-    from oodil.pipeline.evaluation import film
+    from oodil.pipeline.filming import check_writable, film
+    from oodil.pipeline.seeding import derive_key
 
     results = open_run(run_dir)
     environment = results.config.environment
     done = [each.name for each in results.policies if results.is_done(each.name)]
-    for name in [policy] if policy else done or [results.policies[0].name]:
-        trained = results.policy(name)
+    names = [policy] if policy else done or [results.policies[0].name]
+    policies = {name: results.policy(name) for name in names}
+    films = {name: results.path / f"{name}.mp4" for name in names if video}
+    for path in films.values():
+        check_writable(path)
+    for name, trained in policies.items():
+        told = ""
+        if name in films:
+            key = derive_key(seed, "evaluate")
+            env_return = film(trained.gaussian, environment.id, environment.dynamics, key, films[name])
+            told = f"\n{films[name]}: its first episode, return {env_return:.1f}"
         seen = evaluate_policy(trained, environment.id, environment.dynamics, episodes=episodes, seed=seed)
         print(
             f"{name}: return {seen.mean_return:.1f} ± {seen.std_return:.1f}, "
-            f"length {seen.mean_length:.0f}, {episodes} deterministic episodes, seed {seed}"
+            f"length {seen.mean_length:.0f}, {episodes} deterministic episodes, seed {seed}{told}"
         )
-        if video:
-            path = results.path / f"{name}.mp4"
-            env_return = film(trained, environment.id, environment.dynamics, seed, path)
-            print(f"{path}: one episode, return {env_return:.1f}")
 
 
 def score(
