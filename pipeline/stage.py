@@ -110,6 +110,10 @@ class Stage(ABC):
         """Return the stage's files, made of its jobs' artifacts; None when the only job's artifact is the stage's."""
         return None
 
+    def planned_steps(self, config: RunConfig) -> int:
+        """Return about how many environment steps its artifact will take, for a plan; 0 where they do not count."""
+        return 0
+
     def env_steps(self, run: Run) -> int:
         """Return the environment steps that its finished artifact took; 0 for a stage without a simulator."""
         return 0

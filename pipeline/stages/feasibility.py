@@ -53,6 +53,10 @@ class FeasibilityWeighting(Weighting):
             "environment": environment,
         }
 
+    def planned_steps(self, config: RunConfig) -> int:
+        """Return the environment steps of all policies together."""
+        return config.cluster_steps
+
     def jobs(self, run: Run) -> list[str]:
         """Return the one policy."""
         return ["shared"]

@@ -119,6 +119,10 @@ class ImitatorsStage(Stage):
             sha256={job: run.job_artifact(self.name, job).sha256 for job in jobs},
         ).files()
 
+    def planned_steps(self, config: RunConfig) -> int:
+        """Return the environment steps of all imitators, if no cluster stays empty."""
+        return config.cluster_steps
+
     def env_steps(self, run: Run) -> int:
         """Return the environment steps of all imitators together."""
         return TrainedImitators.load(run.artifact(self.name)).env_steps

@@ -67,6 +67,10 @@ class InverseDynamics(Weighting):
         """Return the imitator's environment, and how it is explored and learned from."""
         return config.inverse_dynamics.model_dump() | {"environment": config.environment.model_dump()}
 
+    def planned_steps(self, config: RunConfig) -> int:
+        """Return the steps of the exploration; those of following come on top."""
+        return config.inverse_dynamics.transitions
+
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Explore, learn the model, follow what was held out and every demonstration, and turn errors into scores."""
         import torch

@@ -68,6 +68,11 @@ class PolicyStage(Stage):
         """Return the trainings."""
         return [f"training-{n}" for n in range(1, run.config.imitation.num_trainings + 1)]
 
+    def planned_steps(self, config: RunConfig) -> int:
+        """Return the environment steps of all trainings."""
+        gail = self.gail(config)
+        return config.imitation.num_trainings * gail.num_iterations * gail.steps_per_iteration
+
     def env_steps(self, run: Run) -> int:
         """Return the environment steps of all trainings."""
         return sum(training.env_steps for training in Trainings.load(run.artifact(self.name)).trainings)

@@ -1,6 +1,7 @@
-"""How fast the learner loop of a configuration runs on this machine, by the number of rollout workers."""
+"""How fast this machine is: the learner loop of a configuration by the number of rollout workers, and bare physics."""
 
 import os
+import platform
 import tempfile
 import time
 from collections.abc import Callable
@@ -20,21 +21,24 @@ from oodil.workers.reports import AttemptFailed, Event, Progress
 WARM_UP = 0.3
 """Share of a learner's run that is not counted: processes start, and untrained robots fall all the time."""
 ITERATIONS = 60
-"""Of the learner, for each number of workers that `compare` tries."""
+"""Of the learner, each time that it is measured."""
 
 
 def compare(
     config: RunConfig, counts: list[int], on_result: Callable[[int, dict[str, float]], None]
 ) -> dict[int, dict[str, float]]:
     """Measure each number of workers in turn; see `learner_rate`."""
-    gail = config.imitation.gail
-    short = gail.model_copy(update={"total_steps": ITERATIONS * gail.steps_per_iteration})
-    shortened = config.model_copy(update={"imitation": config.imitation.model_copy(update={"gail": short})})
-    results = {}
+    shortened, results = _shortened(config), {}
     for workers in counts:
         results[workers] = learner_rate(shortened, workers)
         on_result(workers, results[workers])
     return results
+
+
+def _shortened(config: RunConfig) -> RunConfig:
+    gail = config.imitation.gail
+    short = gail.model_copy(update={"total_steps": ITERATIONS * gail.steps_per_iteration})
+    return config.model_copy(update={"imitation": config.imitation.model_copy(update={"gail": short})})
 
 
 def worker_counts() -> list[int]:
@@ -45,22 +49,68 @@ def worker_counts() -> list[int]:
 
 def learner_rate(config: RunConfig, workers: int) -> dict[str, float]:
     """Return steps per second of the learner loop after its warm-up, and the mean episode length at its end."""
-    seen: list[tuple[float, Progress]] = []
+    (figures,) = _rates(config, workers, ["loop"])
+    return figures
+
+
+def side_by_side_rate(config: RunConfig, count: int) -> float:
+    """Return steps per second of each of ``count`` learner loops, every one inline in a process of its own."""
+    # A single loop would be given rollout workers; inline in this process it has none, either.
+    rates = _rates(_shortened(config), count if count > 1 else 0, [f"loop-{n}" for n in range(count)])
+    return float(np.mean([figures["steps_per_s"] for figures in rates]))
+
+
+def _rates(config: RunConfig, workers: int, loops: list[str]) -> list[dict[str, float]]:
+    """Return what `learner_rate` does, for each of several loops at once."""
+    seen: dict[str, list[tuple[float, Progress]]] = {loop: [] for loop in loops}
 
     def on_event(event: Event) -> None:
         if isinstance(event.report, Progress):
-            seen.append((time.perf_counter(), event.report))
+            seen[event.name].append((time.perf_counter(), event.report))
         elif isinstance(event.report, AttemptFailed):
             raise RuntimeError(event.report.reason)
 
     with tempfile.TemporaryDirectory() as folder:
         run = Run(config, RunDirectory(Path(folder)))
         run.directory.config.write_text(config.model_dump_json())
-        LocalEngine(workers).run_jobs(LearnerLoop(), run, ["loop"], on_event, lambda: False)
-    timed = [(at, report) for at, report in seen if report.done >= WARM_UP * report.total]
-    (start, first), (end, last) = timed[0], timed[-1]
-    length = last.metrics.get("length", float("nan"))
-    return {"steps_per_s": (last.done - first.done) / (end - start), "episode_length": length}
+        LocalEngine(workers).run_jobs(LearnerLoop(), run, loops, on_event, lambda: False)
+    rates = []
+    for reports in seen.values():
+        timed = [(at, report) for at, report in reports if report.done >= WARM_UP * report.total]
+        (start, first), (end, last) = timed[0], timed[-1]
+        length = last.metrics.get("length", float("nan"))
+        rates.append({"steps_per_s": (last.done - first.done) / (end - start), "episode_length": length})
+    return rates
+
+
+def raw_rate() -> float:
+    """Return how many control steps of Hopper, four substeps of bare ``mj_step`` each, one core takes in a second."""
+    import gymnasium
+    import mujoco
+
+    model = gymnasium.make("Hopper-v5").unwrapped.model  # type: ignore[attr-defined]
+    data = mujoco.MjData(model)
+    started = time.perf_counter()
+    for step in range(10_000):
+        if step % 500 == 0:
+            mujoco.mj_resetData(model, data)
+        mujoco.mj_step(model, data, nstep=4)
+    return 10_000 / (time.perf_counter() - started)
+
+
+def machine() -> dict[str, Any]:
+    """Describe where the figures come from."""
+    model = "unknown"
+    if Path("/proc/cpuinfo").exists():
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
+    return {
+        "platform": platform.platform(),
+        "cpu": model,
+        "cores": os.cpu_count(),
+        "load_average_before": os.getloadavg(),
+        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
 
 
 class LearnerLoop(Stage):

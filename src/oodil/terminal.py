@@ -129,6 +129,12 @@ class Display(Observer):
             case Event(worker, Replaced(reason)):
                 self.say(f"[yellow]! {worker}: {reason}; started again[/]")
 
+    def job_done(self, job: str) -> None:
+        """Say that a job is done, and take its bar away: there are more jobs than lines on a screen."""
+        if job in self._bars:
+            self._progress.remove_task(self._bars.pop(job))
+        self.say(f"[green]✓[/] {escape(job)}")
+
     def _bar(self, job: str) -> Any:
         if job not in self._bars:
             self._bars[job] = self._progress.add_task(job, total=None, rate="", figures="")

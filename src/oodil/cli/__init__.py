@@ -9,7 +9,7 @@ from typing import Any
 
 import typer
 
-from oodil.cli import demonstrations, machines, policies, runs
+from oodil.cli import demonstrations, experiments, machines, policies, runs
 from oodil.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_STOPPED
 from oodil.pipeline.errors import OodilError, UnfinishedError
 
@@ -51,6 +51,7 @@ for _command in (
     policies.evaluate,
     policies.score,
     policies.finetune,
+    experiments.table,
     runs.bench,
 ):
     app.command()(_command)

@@ -1,0 +1,105 @@
+"""The command that makes a table or a figure: rows x methods x seeds, as many runs at once as there are cores."""
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from oodil.cli.options import EXIT_STOPPED, EngineName, TrustCluster, engine_of
+from oodil.pipeline.errors import UnfinishedError
+
+if TYPE_CHECKING:
+    from oodil.experiments import Table
+    from oodil.pipeline.stage import Stage
+    from oodil.workers.engine import Engine, Outcome
+
+Names = list[str] | None
+
+
+def table(
+    source: Annotated[str, typer.Argument(metavar="EXPERIMENT", help="A YAML file, or one that comes with oodil.")],
+    seeds: Annotated[str | None, typer.Option(help="A-B, or the first N of the file's seeds.")] = None,
+    rows: Annotated[Names, typer.Option("--rows", metavar="ROW", help="Compute this row now; can be repeated.")] = None,
+    methods: Annotated[
+        Names, typer.Option("--methods", metavar="METHOD", help="Compute this method now; can be repeated.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option("--workers", "-w", min=0, help="Runs at once; default: cores.")] = None,
+    engine: EngineName = "local",
+    trust_cluster: TrustCluster = False,
+    plan: Annotated[bool, typer.Option("--plan", help="Say what it would take, and compute nothing.")] = False,
+    folder: Annotated[Path, typer.Option(help="Where the experiment has its folder.")] = Path("tables"),
+) -> None:
+    """Make a table of an experiment; what is finished is reused, what was interrupted goes on."""
+    from oodil.experiments import Table
+    from oodil.pipeline.experiment import load_experiment
+
+    experiment = load_experiment(source)
+    if seeds is not None:
+        experiment = experiment.with_seeds(seeds)
+    made = Table.of(experiment, folder / experiment.name)
+    selected = made.select(rows, methods)
+    cores = os.cpu_count() or 1
+    if plan:
+        _print_plan(made, selected, cores if workers is None else max(workers, 1))
+        return
+    count = cores if workers is None and engine == "local" else workers
+    outcome = _compute(made, selected, engine_of(made.runs[0].config, engine, count, trust_cluster=trust_cluster))
+    print(made.write_results(outcome.failed, sys.argv[1:]))
+    if outcome.failed or outcome.stopped:
+        raise UnfinishedError(_unfinished(outcome, sys.argv[1:]), made.experiment.name, outcome.failed)
+
+
+def _compute(made: "Table", selected: "dict[str, list[Stage]]", engine: "Engine") -> "Outcome":
+    """Compute and show how far the runs are; Ctrl-C once stops politely, twice at once."""
+    from oodil.terminal import Display, stop_flag
+    from oodil.workers.reports import DONE, Event, Finished
+
+    try:
+        with Display() as display, stop_flag(display.stopping) as should_stop:
+
+            def on_event(event: Event) -> None:
+                display.event(event)
+                if event.report == Finished(DONE):
+                    display.job_done(event.name)
+
+            return made.compute(selected, engine, on_event, should_stop)
+    except KeyboardInterrupt:
+        print("\nstopped at once; go on with the same command", file=sys.stderr)
+        raise typer.Exit(EXIT_STOPPED) from None
+
+
+def _unfinished(outcome: "Outcome", arguments: list[str]) -> str:
+    failures = "".join(f"{run} failed:\n{traceback.rstrip()}\n\n" for run, traceback in outcome.failed.items())
+    named = f" ({', '.join(outcome.failed)})" if outcome.failed else ""
+    return (
+        f"{failures}{len(outcome.done)} runs done, {len(outcome.failed)} failed{named}, {len(outcome.not_run)} not "
+        f"finished. What is finished is kept; go on with: oodil {' '.join(arguments)}"
+    )
+
+
+def _print_plan(made: "Table", selected: "dict[str, list[Stage]]", workers: int) -> None:
+    """Print the runs, what each computes and takes over, and how long all of it takes here."""
+    from rich.console import Console
+    from rich.table import Table as Columns
+
+    from oodil.estimate import hours, outlook
+
+    console, found = Console(), outlook(made, selected)
+    shown = Columns("run", "environment steps", "computes", "takes over", "finished", box=None, padding=(0, 2))
+    for each in found:
+        shown.add_row(each.name, f"{each.env_steps:,}", *map(", ".join, (each.own, each.shared, each.finished)))
+    console.print(shown)
+    steps = sum(each.env_steps for each in found)
+    counts = [sum(len(getattr(each, kind)) for each in found) for kind in ("own", "shared", "finished")]
+    console.print(
+        f"{len(found)} runs: {counts[0]} parts to compute, {counts[1]} to take over from another run, "
+        f"{counts[2]} finished; {steps:,} environment steps",
+        highlight=False,
+    )
+    console.print(
+        f"about {hours(found, workers):.2f} hours with {workers} runs at once on this machine, by a measurement of a "
+        "few seconds; it may be off by half",
+        highlight=False,
+    )
