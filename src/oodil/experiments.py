@@ -196,27 +196,35 @@ def _without_what_follows(failed: Stage, stages: Sequence[Stage]) -> list[Stage]
 
 
 def _take_over(stage: Stage, run: Run, others: Sequence[RunDirectory]) -> None:
-    """Copy the jobs that other runs have finished, and go on with those that they have begun.
+    """Copy what other runs have finished of a stage, and go on with the jobs that they have begun.
 
     An artifact of the same origin has the same bytes, whoever made it.
     """
     for job in stage.jobs(run):
-        path, origin = run.directory.job(stage.name, job), stage.job_origin(run, job)
-        if finished(path, origin) is not None:
+        theirs = [other.job(stage.name, job) for other in others]
+        if _is_there(run.directory.job(stage.name, job), stage.job_origin(run, job), theirs):
+            stage.checkpoints(run, job).clear()
             continue
-        for other in others:
-            there = finished(other.job(stage.name, job), origin)
-            if there is not None:
-                write_artifact(path, origin, there.files(), there.versions)
-                stage.checkpoints(run, job).clear()
-                break
-        else:
-            own = stage.checkpoints(run, job)
-            begun = [theirs for other in others if (theirs := other.checkpoints(stage.name, job)).exists()]
-            if begun and not own.exist():
-                own.clear()
-                own.folder.parent.mkdir(parents=True, exist_ok=True)
-                begun[0].rename(own.folder)
+        own = stage.checkpoints(run, job)
+        begun = [path for other in others if (path := other.checkpoints(stage.name, job)).exists()]
+        if begun and not own.exist():
+            own.clear()
+            own.folder.parent.mkdir(parents=True, exist_ok=True)
+            begun[0].rename(own.folder)
+    if all(finished(run.directory.job(stage.name, job), stage.job_origin(run, job)) for job in stage.jobs(run)):
+        _is_there(run.directory.stage(stage.name), stage.origin(run), [other.stage(stage.name) for other in others])
+
+
+def _is_there(path: Path, origin: dict[str, Any], others: Sequence[Path]) -> bool:
+    """Return whether a finished artifact of an origin lies at ``path``, if need be by copying one of some others."""
+    if finished(path, origin):
+        return True
+    for other in others:
+        there = finished(other, origin)
+        if there:
+            write_artifact(path, origin, there.files(), there.versions)
+            return True
+    return False
 
 
 class _Shown(Observer):

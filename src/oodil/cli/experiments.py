@@ -87,19 +87,29 @@ def _print_plan(made: "Table", selected: "dict[str, list[Stage]]", workers: int)
     from oodil.estimate import hours, outlook
 
     console, found = Console(), outlook(made, selected)
-    shown = Columns("run", "environment steps", "computes", "takes over", "finished", box=None, padding=(0, 2))
+    shown = Columns(box=None, padding=(0, 2))
+    shown.add_column("run", no_wrap=True)
+    for heading in ("environment steps", "to compute", "finished"):
+        shown.add_column(heading, justify="right")
+    shown.add_column("taken over from another run")
     for each in found:
-        shown.add_row(each.name, f"{each.env_steps:,}", *map(", ".join, (each.own, each.shared, each.finished)))
+        counts = f"{each.env_steps:,}", str(len(each.own)), str(len(each.finished))
+        shown.add_row(each.name, *counts, ", ".join(each.shared))
     console.print(shown)
     steps = sum(each.env_steps for each in found)
-    counts = [sum(len(getattr(each, kind)) for each in found) for kind in ("own", "shared", "finished")]
+    own, shared, done = (
+        sum(len(stages) for stages in kind)
+        for kind in zip(*((each.own, each.shared, each.finished) for each in found), strict=True)
+    )
     console.print(
-        f"{len(found)} runs: {counts[0]} parts to compute, {counts[1]} to take over from another run, "
-        f"{counts[2]} finished; {steps:,} environment steps",
+        f"{len(found)} runs: {own} stages to compute, {shared} to take over, {done} finished; {steps:,} environment "
+        "steps",
         highlight=False,
+        soft_wrap=True,
     )
     console.print(
         f"about {hours(found, workers):.2f} hours with {workers} runs at once on this machine, by a measurement of a "
         "few seconds; it may be off by half",
         highlight=False,
+        soft_wrap=True,
     )
