@@ -149,7 +149,9 @@ def _describe(problem: Any, model: type[BaseModel]) -> str:
     message = problem["msg"].removeprefix("Value error, ")
     if problem["type"] == "missing":
         return f"{key}: required, but missing"
-    return f"{key}: {message}, got {problem['input']!r}" if problem["type"] != "value_error" else f"{key}: {message}"
+    if problem["type"] == "value_error":
+        return f"{key}: {message}" if key else message
+    return f"{key}: {message}, got {problem['input']!r}"
 
 
 def _fields_at(model: type[BaseModel], location: list[Any]) -> list[str]:
