@@ -3,42 +3,16 @@
 import json
 import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
-import yaml
 
 import oodil
 from oodil.experiments import Table
 from oodil.pipeline.experiment import load_experiment
-from tests.runs import MICRO, LiveRun, artifacts, has_checkpoint, interrupt, nothing_left, run, wait_for
+from tests.runs import LiveRun, artifacts, has_checkpoint, interrupt, nothing_left, run, wait_for
+from tests.tables import RUNS, SHORT, write_experiment
 
 pytestmark = pytest.mark.timeout(600)
-
-SHORT = [
-    "transferability.gail.total_steps=2_000",
-    "imitation.gail.total_steps=4_000",
-    "evaluation.num_points=1",
-    "clustering.num_clusters=1",
-]
-VALUES: dict[str, Any] = {
-    "name": "micro",
-    "run": str(MICRO),
-    "overrides": SHORT,
-    "rows": {"some": [], "all": ["transferability.kept_from=0"]},
-    "methods": ["naive_gail", {"name": "ours", "policy": "imitation"}],
-    "seeds": "0-1",
-    "measure": "mean_return",
-    "published": {"all": {"ours": 3000}},
-}
-RUNS = {"some-seed0", "some-seed1", "all-seed0", "all-seed1"}
-
-
-def write(folder: Path, **changes: Any) -> Path:
-    """Write the experiment with some changes; return its file."""
-    path = folder / "experiment.yaml"
-    path.write_text(yaml.safe_dump(VALUES | changes, sort_keys=False))
-    return path
 
 
 def command(folder: Path, workers: int, *options: str) -> list[str]:
@@ -49,7 +23,7 @@ def command(folder: Path, workers: int, *options: str) -> list[str]:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a table that nothing disturbed, made by one process."""
     folder = tmp_path_factory.mktemp("whole")
-    write(folder)
+    write_experiment(folder)
     run(*command(folder, 1))
     return folder / "micro"
 
@@ -65,9 +39,8 @@ def test_what_a_table_says(whole: Path) -> None:
     results = oodil.open_run(whole / "all-seed1")
     naive, ours = (c for c in found["cells"] if (c["row"], c["seed"]) == ("all", 1))
     assert ours["mean_return"] == results.evaluation().mean_return
-    assert (
-        ours["auroc"] == results.separation()["auroc"] and ours["share_before"] == results.separation()["share_before"]
-    )
+    told = results.separation()
+    assert (ours["auroc"], ours["share_after"]) == (told["auroc"], told["share"])
     assert ours["sources"].keys() == ours["scores"].keys() == {"fast", "slow"}
     # 4,000 steps are 5 iterations of 800; the clusters' imitators and the readings of their scores come on top.
     assert naive["env_steps"] == results.policy("naive_gail").env_steps == 4_000
@@ -94,7 +67,7 @@ def test_an_unchanged_table_computes_nothing(whole: Path) -> None:
 def test_killed_and_resumed_with_other_workers(
     whole: Path, tmp_path: Path, job: str, stage: str, training: str, workers: int, workers_after: int
 ) -> None:
-    write(tmp_path)
+    write_experiment(tmp_path)
     live = LiveRun(*command(tmp_path, workers))
     wait_for(has_checkpoint(tmp_path / "micro" / job, stage, training, 2), "checkpoint")
     live.kill_group()
@@ -105,7 +78,7 @@ def test_killed_and_resumed_with_other_workers(
 
 
 def test_an_interrupt_stops_politely(whole: Path, tmp_path: Path) -> None:
-    write(tmp_path)
+    write_experiment(tmp_path)
     live = LiveRun(*command(tmp_path, 2))
     wait_for(has_checkpoint(tmp_path / "micro" / "some-seed0", "imitators", "cluster-0", 2), "checkpoint")
     interrupt(live, signal.SIGINT)
@@ -125,7 +98,7 @@ def test_an_interrupt_stops_politely(whole: Path, tmp_path: Path) -> None:
 def test_what_runs_have_in_common_is_computed_once(tmp_path: Path) -> None:
     """A method with overrides takes over all but its own policy, and has the bits of an ordinary run."""
     variant = {"name": "kept", "policy": "imitation", "overrides": ["transferability.kept_from=0"]}
-    write(tmp_path, rows={"only": []}, methods=["imitation", variant], seeds=0, published={})
+    write_experiment(tmp_path, rows={"only": []}, methods=["imitation", variant], seeds=0, published={})
     run(*command(tmp_path, 2))
     computed: dict[str, list[str]] = {}
     for name in ("only-seed0", "only-kept-seed0"):
@@ -148,7 +121,7 @@ def test_what_runs_have_in_common_is_computed_once(tmp_path: Path) -> None:
 
 def test_one_that_fails_leaves_the_others_alone_and_is_named(tmp_path: Path) -> None:
     never = "tests.raising:never"
-    write(tmp_path, rows={"only": [], "other": []}, methods=[never, "naive_gail"], seeds=0, published={})
+    write_experiment(tmp_path, rows={"only": [], "other": []}, methods=[never, "naive_gail"], seeds=0, published={})
     code, output = LiveRun(*command(tmp_path, 2)).finish()
     assert code == 1, output
     assert "0 runs done, 2 failed (only-seed0, other-seed0), 0 not finished" in output
@@ -164,17 +137,17 @@ def test_one_that_fails_leaves_the_others_alone_and_is_named(tmp_path: Path) -> 
 
 
 def test_another_configuration_is_refused(whole: Path) -> None:
-    write(whole.parent, overrides=[*SHORT, "imitation.gail.discount=0.9"])
+    write_experiment(whole.parent, overrides=[*SHORT, "imitation.gail.discount=0.9"])
     before = (whole / "results.json").read_bytes()
     code, output = LiveRun(*command(whole.parent, 1)).finish()
-    write(whole.parent)
+    write_experiment(whole.parent)
     assert code == 2 and "some-seed0: naive_gail is finished with other settings" not in output, output
     assert "is finished with other settings (gail.discount 0.995 -> 0.9); choose another --folder" in output
     assert (whole / "results.json").read_bytes() == before
 
 
 def test_a_plan_computes_nothing(tmp_path: Path) -> None:
-    write(tmp_path)
+    write_experiment(tmp_path)
     output = run(*command(tmp_path, 1, "--plan", "--rows", "all"))
     assert "2 runs: 12 stages to compute, 0 to take over, 0 finished" in output
     assert "hours with 1 runs at once on this machine" in output

@@ -128,7 +128,10 @@ def test_seeds(experiment):
         ({"measure": "returns"}, "measure: Input should be 'mean_return'"),
         ({"rows": {}}, "rows: Dictionary should have at least 1 item"),
         ({"seeds": "3-2"}, "seeds: .*at least 1 item"),
-        ({"methods": ["imitation", "imitation"]}, "experiment.yaml: two methods have the same name: imitation, imitation"),
+        (
+            {"methods": ["imitation", "imitation"]},
+            "experiment.yaml: two methods have the same name: imitation",
+        ),
         ({"methods": ["gail"]}, "row '1:2': .*baselines: no policy 'gail'; there are imitation"),
         ({"published": {"3:3": {}}}, "published: no row '3:3'; there are 1:2, 2:1"),
         ({"published": {"1:2": {"bc": 1}}}, "published: 1:2: no method 'bc'; there are imitation, naive_gail, kept"),
