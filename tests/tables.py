@@ -5,17 +5,22 @@ from typing import Any
 
 import yaml
 
-from tests.runs import MICRO
-
 SHORT = [
-    "transferability.gail.total_steps=2_000",
-    "imitation.gail.total_steps=4_000",
-    "evaluation.num_points=1",
+    "transferability.gail.total_steps=1_600",
+    "transferability.gail.steps_per_rollout=20",
+    "transferability.reading.steps=5",
+    "imitation.gail.total_steps=3_200",
+    "imitation.gail.steps_per_rollout=20",
+    "imitation.num_trainings=1",
     "clustering.num_clusters=1",
+    "evaluation.num_points=1",
+    "evaluation.final_episodes=2",
+    "runtime.checkpoint_interval_s=0",
+    "runtime.restart_delay_s=0.1",
 ]
 _VALUES: dict[str, Any] = {
     "name": "micro",
-    "run": str(MICRO),
+    "run": "quick/driving",
     "overrides": SHORT,
     "rows": {"some": [], "all": ["transferability.kept_from=0"]},
     "methods": ["naive_gail", {"name": "ours", "policy": "imitation"}],

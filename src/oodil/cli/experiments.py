@@ -71,8 +71,8 @@ def _compute(made: "Table", selected: "dict[str, list[Stage]]", engine: "Engine"
 
 
 def _unfinished(outcome: "Outcome", arguments: list[str]) -> str:
-    failures = "".join(f"{run} failed:\n{traceback.rstrip()}\n\n" for run, traceback in outcome.failed.items())
-    named = f" ({', '.join(outcome.failed)})" if outcome.failed else ""
+    failures = "".join(f"{run} failed:\n{reason.rstrip()}\n\n" for run, reason in sorted(outcome.failed.items()))
+    named = f" ({', '.join(sorted(outcome.failed))})" if outcome.failed else ""
     return (
         f"{failures}{len(outcome.done)} runs done, {len(outcome.failed)} failed{named}, {len(outcome.not_run)} not "
         f"finished. What is finished is kept; go on with: oodil {' '.join(arguments)}"
