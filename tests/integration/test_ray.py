@@ -26,7 +26,7 @@ from oodil.workers.reports import DONE, Event, Finished, Progress, Started
 from tests.fakes import FakeStage, chain, failures, fake_run, hopper_units, lines, wait_until
 from tests.flaky import FOLDER_VARIABLE
 from tests.runs import MICRO
-from tests.tables import write_experiment
+from tests.tables import SHORT, write_experiment
 
 pytestmark = [pytest.mark.ray, pytest.mark.timeout(300)]
 
@@ -157,7 +157,9 @@ def test_a_node_dies_in_the_middle_of_a_run(tmp_path: Path, cluster: Cluster) ->
 
 def test_a_node_dies_in_the_middle_of_a_table(tmp_path: Path, cluster: Cluster) -> None:
     """Whole runs are tasks, and what they share is computed once, wherever they are."""
-    experiment = load_experiment(write_experiment(tmp_path, methods=["naive_gail"], published={}))
+    longer = [*SHORT, "imitation.gail.total_steps=32_000"]
+    file = write_experiment(tmp_path, overrides=longer, methods=["naive_gail"], published={})
+    experiment = load_experiment(file)
     tables = {name: Table.of(experiment, tmp_path / name) for name in ("inline", "ray")}
     selected = {name: table.select(None, None) for name, table in tables.items()}
     second = cluster.worker_nodes
@@ -171,7 +173,8 @@ def test_a_node_dies_in_the_middle_of_a_table(tmp_path: Path, cluster: Cluster) 
     killer.start()
     outcome = tables["ray"].compute(selected["ray"], RayEngine(), lambda event: None, lambda: False)
     killer.join()
-    assert len(outcome.done) == 4 and len([node for node in ray.nodes() if node["Alive"]]) == 1
+    assert len(outcome.done) == 4
+    wait_until(lambda: len([node for node in ray.nodes() if node["Alive"]]) == 1, timeout_s=120)
     inline, on_ray = (table.write_results({}, []).read_bytes() for table in tables.values())
     assert inline == on_ray
 
