@@ -10,7 +10,6 @@ if __name__ == "__main__":
 
     main()
 
-import fcntl
 import json
 import shutil
 import time
@@ -19,11 +18,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from oodil.pipeline.artifacts import RunDirectory, read_artifact, remove_artifact, write_artifact, write_file
+from oodil.pipeline.artifacts import Artifact, RunDirectory, read_artifact, remove_artifact, write_artifact, write_file
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.environments import check_environment
 from oodil.pipeline.errors import ConfigError, DamagedArtifactError, StorageError, UnfinishedError
 from oodil.pipeline.loading import parse_config
+from oodil.pipeline.locks import held
 from oodil.pipeline.stage import Run, Stage, state_of
 from oodil.pipeline.stages import stages
 from oodil.pipeline.stages.demonstrations import check_demonstrations
@@ -214,36 +214,30 @@ def _pending(stage: Stage, run: Run, forced: bool) -> list[str]:
         path = run.directory.job(stage.name, job)
         if forced:
             stage.checkpoints(run, job).clear()
-        if forced or not _is_current(path, stage.job_origin(run, job)):
+        if forced or finished(path, stage.job_origin(run, job)) is None:
             remove_artifact(path)
             pending.append(job)
     return pending
 
 
-def _is_current(path: Path, origin: dict[str, Any]) -> bool:
-    """Return whether an undamaged artifact of this origin lies at ``path``."""
+def finished(path: Path, origin: dict[str, Any]) -> Artifact | None:
+    """Return the artifact at ``path`` if it is of this origin and undamaged."""
     try:
         artifact = read_artifact(path)
         if artifact is None or not artifact.made_from(origin):
-            return False
+            return None
         artifact.verify()
     except DamagedArtifactError:
-        return False
-    return True
+        return None
+    return artifact
 
 
 @contextmanager
 def _lock(directory: RunDirectory) -> Iterator[None]:
-    """Hold the run for this process; the lock goes with the process, however it ends."""
-    try:
-        file = open(directory.path / ".lock", "w")  # noqa: SIM115 (closed below, after what it protects)
-    except OSError as error:
-        raise StorageError(f"{directory.path}: {error.strerror or error}") from error
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise ConfigError(f"{directory.path}: another process is working on this run") from None
+    """Hold the run for this process."""
+    with held(directory.path / ".lock") as is_held:
+        if not is_held:
+            raise ConfigError(f"{directory.path}: another process is working on this run")
         yield
 
 

@@ -8,17 +8,14 @@ import argparse
 import json
 import math
 import os
-import platform
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
-import gymnasium
-import mujoco
 import torch
 from threadpoolctl import threadpool_limits
 
+from oodil.bench import machine
 from oodil.pipeline.artifacts import Checkpoints
 from oodil.pipeline.collecting import InlineRollouts, RolloutSource
 from oodil.pipeline.config import RunConfig
@@ -52,36 +49,9 @@ def seeds_of(text: str) -> range:
     return range(int(first), int(last or first) + 1)
 
 
-def raw_rate() -> float:
-    """Return how many control steps of Hopper, four substeps of bare ``mj_step`` each, one core takes in a second."""
-    model = gymnasium.make("Hopper-v5").unwrapped.model  # type: ignore[attr-defined]
-    data = mujoco.MjData(model)
-    started = time.perf_counter()
-    for step in range(10_000):
-        if step % 500 == 0:
-            mujoco.mj_resetData(model, data)
-        mujoco.mj_step(model, data, nstep=4)
-    return 10_000 / (time.perf_counter() - started)
-
-
 def circumstances() -> dict[str, Any]:
     """Return what figures depend on; ask before anything is measured, since the load is part of it."""
     return {"machine": machine(), "versions": library_versions()}
-
-
-def machine() -> dict[str, Any]:
-    """Describe where the figures come from."""
-    model = "unknown"
-    if Path("/proc/cpuinfo").exists():
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
-    return {
-        "platform": platform.platform(),
-        "cpu": model,
-        "cores": os.cpu_count(),
-        "load_average_before": os.getloadavg(),
-        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-    }
 
 
 def save(path: Path | None, found: dict[str, Any]) -> None:

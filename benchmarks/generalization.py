@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import arguments_of, circumstances, raw_rate, save
+from common import arguments_of, circumstances, save
 
 import oodil
+from oodil.bench import raw_rate
 from oodil.pipeline.artifacts import write_file
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations

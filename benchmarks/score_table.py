@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import arguments_of, circumstances, raw_rate, save, seeds_of
+from common import arguments_of, circumstances, save, seeds_of
 
 import oodil
+from oodil.bench import raw_rate
 from oodil.pipeline.results import Trainings
 
 WORST = "auroc", "share", "effective_number"

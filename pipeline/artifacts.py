@@ -46,9 +46,9 @@ def below(prefix: str, values: Mapping[str, Value]) -> dict[str, Value]:
     return {name.removeprefix(start): value for name, value in values.items() if name.startswith(start)}
 
 
-def encode_json(value: Any) -> bytes:
-    """Return readable JSON with sorted keys; numbers that are not finite become null."""
-    return (json.dumps(_finite(value), indent=2, sort_keys=True, allow_nan=False) + "\n").encode()
+def encode_json(value: Any, sort_keys: bool = True) -> bytes:
+    """Return readable JSON, keys sorted or in their order; numbers that are not finite become null."""
+    return (json.dumps(_finite(value), indent=2, sort_keys=sort_keys, allow_nan=False) + "\n").encode()
 
 
 def _finite(value: Any) -> Any:

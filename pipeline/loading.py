@@ -3,9 +3,9 @@
 import copy
 import difflib
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -14,27 +14,44 @@ from oodil.pipeline.config import RunConfig
 from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.stages import stages
 
+Model = TypeVar("Model", bound=BaseModel)
+
 SHIPPED = Path(__file__).absolute().parents[1] / "configs"
 """The configurations that come with oodil, beside this package and not found by way of a link to it."""
+EXPERIMENTS = SHIPPED / "experiments"
+"""The tables and figures that are made of them."""
 
 
 def shipped_configs() -> dict[str, Path]:
     """Return the configurations that come with oodil by name, such as ``hopper`` or ``quick/driving``."""
-    return {str(path.relative_to(SHIPPED).with_suffix("")): path for path in sorted(SHIPPED.rglob("*.yaml"))}
+    return _named(path for path in SHIPPED.rglob("*.yaml") if EXPERIMENTS not in path.parents)
+
+
+def shipped_experiments() -> dict[str, Path]:
+    """Return the experiments that come with oodil by name (`oodil.pipeline.experiment`)."""
+    return {name.removeprefix("experiments/"): path for name, path in _named(EXPERIMENTS.rglob("*.yaml")).items()}
+
+
+def _named(paths: Iterable[Path]) -> dict[str, Path]:
+    return {str(path.relative_to(SHIPPED).with_suffix("")): path for path in sorted(paths)}
 
 
 def find_config(source: str | Path) -> Path:
     """Return the file that a path, or else the name of a shipped configuration, stands for. Raises ConfigError."""
+    return find_file(source, shipped_configs(), "configuration")
+
+
+def find_file(source: str | Path, shipped: Mapping[str, Path], kind: str) -> Path:
+    """Return the file that a path, or else the name of something that comes with oodil, stands for."""
     path = Path(source)
     if path.is_file():
         return path
-    shipped = shipped_configs()
     name = str(source).removesuffix(".yaml")
     if name in shipped:
         return shipped[name]
     near = difflib.get_close_matches(name, shipped, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(shipped)}"
-    raise ConfigError(f"{source}: no such file, and no configuration of this name comes with oodil; {hint}")
+    raise ConfigError(f"{source}: no such file, and no {kind} of this name comes with oodil; {hint}")
 
 
 def load_config(
@@ -56,7 +73,7 @@ def load_config(
         values, origin, base = copy.deepcopy(dict(source)), "configuration", Path.cwd()
     else:
         path = find_config(source)
-        values, origin, base = _read_yaml(path), str(path), path.resolve().parent
+        values, origin, base = read_yaml(path), str(path), path.resolve().parent
     for override in overrides or ():
         if isinstance(source, RunConfig) and override.partition("=")[0] in ("preset", "clustering.preset"):
             raise ConfigError(f"override {override!r}: a configuration that is made leaves nothing open for a preset")
@@ -70,11 +87,7 @@ def parse_config(values: dict[str, Any], origin: str) -> RunConfig:
 
     Modules of its own can be imported from then on.
     """
-    try:
-        config = RunConfig.model_validate(values)
-    except ValidationError as error:
-        problems = [_describe(problem) for problem in error.errors()]
-        raise ConfigError("\n".join(f"{origin}: {problem}" for problem in problems)) from None
+    config = validated(RunConfig, values, origin)
     find_modules(config)
     try:
         for stage in stages(config):
@@ -108,7 +121,17 @@ def _name_modules(values: dict[str, Any], base: Path) -> None:
         values["runtime"] = (runtime or {}) | {"modules": str(base / (given or "."))}
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def validated(model: type[Model], values: Any, origin: str) -> Model:
+    """Return plain values as a model. Raises ConfigError with one line per problem, as `parse_config` does."""
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        problems = [_describe(problem, model) for problem in error.errors()]
+        raise ConfigError("\n".join(f"{origin}: {problem}" for problem in problems)) from None
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Return the mapping that a file holds. Raises ConfigError."""
     try:
         values = yaml.safe_load(path.read_text())
     except OSError as error:
@@ -145,23 +168,25 @@ def _index(entries: list[Any], part: str, override: str) -> int:
     return int(part)
 
 
-def _describe(problem: Any) -> str:
+def _describe(problem: Any, model: type[BaseModel]) -> str:
     location = [part for part in problem["loc"] if part not in ("trpo", "ppo")]
     key = ".".join(str(part) for part in location)
     if problem["type"] == "extra_forbidden":
-        known = _fields_at(location[:-1])
+        known = _fields_at(model, location[:-1])
         near = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
         hint = f"; did you mean {near[0]!r}?" if near else f"; valid keys: {', '.join(known)}"
         return f"unknown key {key!r}{hint}"
     message = problem["msg"].removeprefix("Value error, ")
     if problem["type"] == "missing":
         return f"{key}: required, but missing"
-    return f"{key}: {message}, got {problem['input']!r}" if problem["type"] != "value_error" else f"{key}: {message}"
+    if problem["type"] == "value_error":
+        return f"{key}: {message}" if key else message
+    return f"{key}: {message}, got {problem['input']!r}"
 
 
-def _fields_at(location: list[Any]) -> list[str]:
-    """Return the keys that are valid at a place of the configuration."""
-    models: list[Any] = [RunConfig]
+def _fields_at(model: type[BaseModel], location: list[Any]) -> list[str]:
+    """Return the keys that are valid at a place of a model."""
+    models: list[Any] = [model]
     for part in location:
         if isinstance(part, int):
             continue

@@ -18,7 +18,7 @@ def main(stages: int, jobs: int) -> None:
     sys.setswitchinterval(1e-4)  # Or each line would wait for the busy thread.
     threading.Thread(target=lambda: [sum(range(1000)) for _ in iter(over.is_set, True)], daemon=True).start()
     now = 0.0
-    with Display(RunCost(costs, 10_000.0, 2), clock=lambda: now) as display:
+    with Display(RunCost(costs, 2), clock=lambda: now) as display:
         for n, stage in enumerate(costs):
             display.stage_started(stage, "", jobs)
             for first in range(0, jobs, 2):

@@ -2,13 +2,16 @@
 
 import os
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from oodil.experiments import Table
+from oodil.pipeline.artifacts import fingerprint
+from oodil.pipeline.config import EnvironmentConfig
 from oodil.pipeline.environments import make_batch
+from oodil.pipeline.runs import RunResults
 from oodil.pipeline.stage import Run, Stage, state_of
 
 MEASURED_S = 0.3
@@ -32,8 +35,6 @@ class RunCost:
 
     stages: dict[str, StageCost]
     """Of all chosen stages, in their order."""
-    steps_per_s: float
-    """Of the simulator, on one core."""
     workers: int | None
     """Processes that compute at the same time; None if that is not known."""
 
@@ -44,14 +45,13 @@ class RunCost:
         told = f"to do: {_counted(steps)} environment steps" if steps else "to do: no environment steps"
         if self.workers is not None:
             told += f", about {_minutes(minutes)}" if minutes >= 1 else ", a minute or less"
-        return f"{told} ({self.steps_per_s:,.0f} steps/s a core)"
+        return told
 
 
 def run_cost(run: Run, chosen: Sequence[Stage], workers: int | None, force: Collection[str] = ()) -> RunCost:
     """Return what the chosen stages of a run will cost; ``workers`` is None for an engine that alone knows it."""
     config = run.config
-    environment = config.environment
-    step_s = step_seconds(environment.id, environment.dynamics, config.imitation.gail.simulators_per_group)
+    step_s = step_seconds(config.environment, config.imitation.gail.simulators_per_group)
     costs: dict[str, StageCost] = {}
     for stage in chosen:
         computed = any(costs[name].seconds for name in stage.inputs if name in costs) or stage.name in force
@@ -65,12 +65,62 @@ def run_cost(run: Run, chosen: Sequence[Stage], workers: int | None, force: Coll
         else:
             seconds = cost.core_s / cost.jobs * -(-cost.jobs // cores)
         costs[stage.name] = StageCost(cost.env_steps, START_S + seconds, cost.jobs)
-    return RunCost(costs, 1 / step_s, workers)
+    return RunCost(costs, workers)
 
 
-def step_seconds(env_id: str, dynamics: Mapping[str, Any], count: int) -> float:
+@dataclass(frozen=True)
+class Outlook:
+    """What is left to do for a run."""
+
+    name: str
+    cost: StageCost
+    """Of the stages that it computes itself, in one process."""
+    finished: list[str]
+    """Stages that some run of the table has finished."""
+    shared: list[str]
+    """Stages that a run before it in the list computes."""
+    own: list[str]
+    """Stages that it computes itself."""
+
+
+def outlook(table: Table, selected: dict[str, list[Stage]]) -> list[Outlook]:
+    """Return what is left to do for the selected runs, in their order."""
+    runs = {run.name: run for run in table.runs}
+    results = {run.name: RunResults(table.opened(run)) for run in table.runs}
+    rates: dict[str, float] = {}
+    done = {part for run in table.runs for stage, part in run.parts.items() if results[run.name].is_done(stage)}
+    taken: set[str] = set()
+    found = []
+    for name, stages in selected.items():
+        parts, config = runs[name].parts, runs[name].config
+        kinds: dict[str, list[Stage]] = {"finished": [], "shared": [], "own": []}
+        for stage in stages:
+            part = parts[stage.name]
+            kinds["finished" if part in done else "shared" if part in taken else "own"].append(stage)
+            taken.add(part)
+        environment = fingerprint([config.environment.id, config.environment.settings()])
+        if environment not in rates:
+            rates[environment] = step_seconds(config.environment, config.imitation.gail.simulators_per_group)
+        costs = [stage.cost(config, rates[environment]) for stage in kinds["own"]]
+        seconds = sum(START_S + cost.core_s for cost in costs)
+        cost = StageCost(sum(cost.env_steps for cost in costs), seconds, 1)
+        names = {kind: [stage.name for stage in those] for kind, those in kinds.items()}
+        found.append(Outlook(name, cost, **names))
+    return found
+
+
+def table_cost(found: Sequence[Outlook], workers: int | None) -> RunCost:
+    """Return what the rest of an experiment will cost, as one stage whose jobs are its runs."""
+    seconds = [each.cost.seconds for each in found]
+    at_once = max(1, min(workers or 1, usable_cores(), sum(each.cost.env_steps > 0 for each in found)))
+    steps = sum(each.cost.env_steps for each in found)
+    together = max(sum(seconds) / at_once, max(seconds, default=0.0))
+    return RunCost({"table": StageCost(steps, together, len(found))}, workers)
+
+
+def step_seconds(environment: EnvironmentConfig, count: int = 8) -> float:
     """Return how long a step of an environment takes on one core, by so many simulators under random actions."""
-    simulators = make_batch(env_id, dynamics, count)
+    simulators = make_batch(environment.id, environment.dynamics, count)
     rng = np.random.default_rng(0)
     for index in range(count):
         simulators.reset(index, seed=index)

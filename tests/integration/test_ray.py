@@ -10,10 +10,12 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
+from oodil.experiments import Table
 from oodil.orchestrator import execute, open_run
 from oodil.pipeline.artifacts import read_artifact
 from oodil.pipeline.collecting import InlineRollouts
 from oodil.pipeline.errors import ConfigError, UnusableEnvironmentError
+from oodil.pipeline.experiment import load_experiment
 from oodil.pipeline.loading import load_config
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.stages import stages
@@ -24,6 +26,7 @@ from oodil.workers.reports import DONE, Event, Finished, Progress, Started
 from tests.fakes import FakeStage, chain, failures, fake_run, hopper_units, lines, wait_until
 from tests.flaky import FOLDER_VARIABLE
 from tests.runs import MICRO
+from tests.tables import SHORT, write_experiment
 
 pytestmark = [pytest.mark.ray, pytest.mark.timeout(300)]
 
@@ -150,6 +153,30 @@ def test_a_node_dies_in_the_middle_of_a_run(tmp_path: Path, cluster: Cluster) ->
     assert len([node for node in ray.nodes() if node["Alive"]]) == 1
     hashes = [[run.artifact(stage.name).sha256 for stage in stages(config)] for run in runs.values()]
     assert hashes[0] == hashes[1]
+
+
+def test_a_node_dies_in_the_middle_of_a_table(tmp_path: Path, cluster: Cluster) -> None:
+    """Whole runs are tasks, and what they share is computed once, wherever they are."""
+    longer = [*SHORT, "imitation.gail.total_steps=32_000"]
+    file = write_experiment(tmp_path, overrides=longer, methods=["naive_gail"], published={})
+    experiment = load_experiment(file)
+    tables = {name: Table.of(experiment, tmp_path / name) for name in ("inline", "ray")}
+    selected = {name: table.select(None, None) for name, table in tables.items()}
+    second = cluster.worker_nodes
+
+    def kill() -> None:
+        wait_until(lambda: any((tmp_path / "ray").glob("*/checkpoints/naive_gail/*/*")), timeout_s=120)
+        cluster.remove_node(next(iter(second)), allow_graceful=False)
+
+    killer = threading.Thread(target=kill)
+    tables["inline"].compute(selected["inline"], LocalEngine(0), lambda event: None, lambda: False)
+    killer.start()
+    outcome = tables["ray"].compute(selected["ray"], RayEngine(), lambda event: None, lambda: False)
+    killer.join()
+    assert len(outcome.done) == 4
+    wait_until(lambda: len([node for node in ray.nodes() if node["Alive"]]) == 1, timeout_s=120)
+    inline, on_ray = (table.write_results({}, []).read_bytes() for table in tables.values())
+    assert inline == on_ray
 
 
 def test_a_cluster_of_several_machines_must_ask_for_a_token(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:

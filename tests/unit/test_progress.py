@@ -113,8 +113,8 @@ def test_what_a_run_costs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_what_a_cost_says() -> None:
-    cost = RunCost({"a": StageCost(4_812_345, 300.0, 1), "b": StageCost(0, 70.0, 1)}, 14_697.0, 2)
-    assert str(cost) == "to do: 4.8 million environment steps, about 6 min (14,697 steps/s a core)"
-    assert str(replace(cost, workers=None)) == "to do: 4.8 million environment steps (14,697 steps/s a core)"
+    cost = RunCost({"a": StageCost(4_812_345, 300.0, 1), "b": StageCost(0, 70.0, 1)}, 2)
+    assert str(cost) == "to do: 4.8 million environment steps, about 6 min"
+    assert str(replace(cost, workers=None)) == "to do: 4.8 million environment steps"
     long = replace(cost, stages={"a": StageCost(122_880, 40_000.0, 1)})
-    assert str(long) == "to do: 120,000 environment steps, about 11.1 h (14,697 steps/s a core)"
+    assert str(long) == "to do: 120,000 environment steps, about 11.1 h"

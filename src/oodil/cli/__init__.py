@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from oodil import __version__
-from oodil.cli import demonstrations, doctor, machines, policies, runs
+from oodil.cli import demonstrations, doctor, experiments, machines, policies, runs
 from oodil.cli.encoding import fit_encoding
 from oodil.cli.options import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_STOPPED
 from oodil.pipeline.errors import OodilError, UnfinishedError
@@ -67,6 +67,7 @@ for _command in (
     policies.evaluate,
     policies.score,
     policies.finetune,
+    experiments.table,
     runs.bench,
     doctor.doctor,
 ):

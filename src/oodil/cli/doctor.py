@@ -102,8 +102,9 @@ def _threads() -> Iterator[Finding]:
 
 def _rate() -> Iterator[Finding]:
     from oodil.estimate import step_seconds
+    from oodil.pipeline.config import EnvironmentConfig
 
-    rate = 1 / step_seconds("oodil/Hopper-v0", {}, 8)
+    rate = 1 / step_seconds(EnvironmentConfig(id="oodil/Hopper-v0"))
     found = f"{rate:,.0f} steps/s of Hopper on one core ({REFERENCE_STEPS_PER_S:,} where the documents' times are from)"
     slow = f"runs take {REFERENCE_STEPS_PER_S / rate:.0f} times as long as in the documents"
     yield Finding("simulator", found, slow if rate < REFERENCE_STEPS_PER_S / 2 else "")

@@ -1,0 +1,121 @@
+"""The command that makes a table or a figure: rows x methods x seeds, as many runs at once as there are cores."""
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from oodil.cli.options import EXIT_STOPPED, EngineName, TrustCluster, engine_of
+from oodil.pipeline.errors import UnfinishedError
+
+if TYPE_CHECKING:
+    from oodil.experiments import Table
+    from oodil.pipeline.stage import Stage
+    from oodil.workers.engine import Engine, Outcome
+
+Names = list[str] | None
+
+
+def table(
+    source: Annotated[str, typer.Argument(metavar="EXPERIMENT", help="A YAML file, or one that comes with oodil.")],
+    seeds: Annotated[str | None, typer.Option(help="A-B, or the first N of the file's seeds.")] = None,
+    rows: Annotated[Names, typer.Option("--rows", metavar="ROW", help="Compute this row now; can be repeated.")] = None,
+    methods: Annotated[
+        Names, typer.Option("--methods", metavar="METHOD", help="Compute this method now; can be repeated.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option("--workers", "-w", min=0, help="Runs at once; default: cores.")] = None,
+    engine: EngineName = "local",
+    trust_cluster: TrustCluster = False,
+    plan: Annotated[bool, typer.Option("--plan", help="Say what it would take, and compute nothing.")] = False,
+    folder: Annotated[Path, typer.Option(help="Where the experiment has its folder.")] = Path("tables"),
+) -> None:
+    """Make a table of an experiment; what is finished is reused, what was interrupted goes on."""
+    from oodil.experiments import Table
+    from oodil.pipeline.experiment import load_experiment
+    from oodil.pipeline.report.table import write_table
+
+    experiment = load_experiment(source)
+    if seeds is not None:
+        experiment = experiment.with_seeds(seeds)
+    made = Table.of(experiment, folder / experiment.name)
+    selected = made.select(rows, methods)
+    cores = os.cpu_count() or 1
+    if plan:
+        _print_plan(made, selected, cores if workers is None else max(workers, 1))
+        return
+    count = cores if workers is None and engine == "local" else workers
+    outcome = _compute(made, selected, engine_of(made.runs[0].config, engine, count, trust_cluster=trust_cluster))
+    made.write_results(outcome.failed, sys.argv[1:])
+    print(write_table(made.folder))
+    if outcome.failed or outcome.stopped:
+        raise UnfinishedError(_unfinished(outcome, sys.argv[1:]), made.experiment.name, outcome.failed)
+
+
+def _compute(made: "Table", selected: "dict[str, list[Stage]]", engine: "Engine") -> "Outcome":
+    """Compute and show how far the runs are; Ctrl-C once stops politely, twice at once."""
+    from oodil.estimate import outlook, table_cost
+    from oodil.terminal import Display, stop_flag
+    from oodil.workers.reports import DONE, Event, Finished
+
+    cost = table_cost(outlook(made, selected), engine.workers)
+    try:
+        with Display(cost) as display, stop_flag(display.stopping) as is_asked_to_stop:
+
+            def should_stop() -> bool:
+                display.tick()
+                return is_asked_to_stop()
+
+            def on_event(event: Event) -> None:
+                display.event(event)
+                if event.report == Finished(DONE):
+                    display.say(f"✓ {event.name}", "green")
+
+            display.stage_started("table", "", len(selected))
+            return made.compute(selected, engine, on_event, should_stop)
+    except KeyboardInterrupt:
+        print("\nstopped at once; go on with the same command", file=sys.stderr)
+        raise typer.Exit(EXIT_STOPPED) from None
+
+
+def _unfinished(outcome: "Outcome", arguments: list[str]) -> str:
+    failures = "".join(f"{run} failed:\n{reason.rstrip()}\n\n" for run, reason in sorted(outcome.failed.items()))
+    named = f" ({', '.join(sorted(outcome.failed))})" if outcome.failed else ""
+    return (
+        f"{failures}{len(outcome.done)} runs done, {len(outcome.failed)} failed{named}, {len(outcome.not_run)} not "
+        f"finished. What is finished is kept; go on with: oodil {' '.join(arguments)}"
+    )
+
+
+def _print_plan(made: "Table", selected: "dict[str, list[Stage]]", workers: int) -> None:
+    """Print the runs, what each computes and takes over, and how long all of it takes here."""
+    from rich.console import Console
+    from rich.table import Table as Columns
+
+    from oodil.estimate import outlook, table_cost
+
+    console, found = Console(), outlook(made, selected)
+    shown = Columns(box=None, padding=(0, 2))
+    shown.add_column("run", no_wrap=True)
+    for heading in ("environment steps", "to compute", "finished"):
+        shown.add_column(heading, justify="right")
+    shown.add_column("taken over from another run")
+    for each in found:
+        counts = f"{each.cost.env_steps:,}", str(len(each.own)), str(len(each.finished))
+        shown.add_row(each.name, *counts, ", ".join(each.shared))
+    console.print(shown)
+    own, shared, done = (
+        sum(len(stages) for stages in kind)
+        for kind in zip(*((each.own, each.shared, each.finished) for each in found), strict=True)
+    )
+    console.print(
+        f"{len(found)} runs: {own} stages to compute, {shared} to take over, {done} finished",
+        highlight=False,
+        soft_wrap=True,
+    )
+    console.print(
+        f"{table_cost(found, workers)} with {workers} runs at once; by a short measurement, it may be off by half",
+        highlight=False,
+        soft_wrap=True,
+    )

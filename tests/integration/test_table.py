@@ -1,0 +1,155 @@
+"""A table is the same bytes whatever happens on the way, with real processes and real signals."""
+
+import json
+import signal
+from pathlib import Path
+
+import pytest
+
+import oodil
+from oodil.experiments import Table
+from oodil.pipeline.experiment import load_experiment
+from tests.runs import LiveRun, artifacts, has_checkpoint, interrupt, nothing_left, run, wait_for
+from tests.tables import RUNS, SHORT, write_experiment
+
+pytestmark = pytest.mark.timeout(600)
+
+
+def command(folder: Path, workers: int, *options: str) -> list[str]:
+    return ["table", str(folder / "experiment.yaml"), "--folder", str(folder), "--workers", str(workers), *options]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a table that nothing disturbed, made by one process."""
+    folder = tmp_path_factory.mktemp("whole")
+    write_experiment(folder)
+    run(*command(folder, 1))
+    return folder / "micro"
+
+
+def test_what_a_table_says(whole: Path) -> None:
+    found = json.loads((whole / "results.json").read_bytes())
+    assert list(found["methods"].items()) == [("naive_gail", "naive GAIL"), ("ours", "ours")]
+    assert (found["rows"], found["seeds"], found["figure"]) == (["some", "all"], [0, 1], "mean_return")
+    assert found["published"] == {"all": {"ours": 3000.0}} and not found["failed"] and not found["missing"]
+    assert [(cell["row"], cell["method"], cell["seed"]) for cell in found["cells"]] == [
+        (row, method, seed) for row in ("some", "all") for method in ("naive_gail", "ours") for seed in (0, 1)
+    ]
+    results = oodil.open_run(whole / "all-seed1")
+    naive, ours = (c for c in found["cells"] if (c["row"], c["seed"]) == ("all", 1))
+    assert ours["mean_return"] == results.evaluation().mean_return
+    told = results.separation()
+    assert (ours["auroc"], ours["share_after"]) == (told["auroc"], told["share"])
+    assert ours["sources"].keys() == ours["scores"].keys() == {"first obstacle wider", "five times as fast"}
+    # 3,200 steps are 10 iterations of 4 x 4 x 20; the clusters' imitators and the readings of their scores come on top.
+    assert naive["env_steps"] == results.policy("naive_gail").env_steps == 3_200
+    assert ours["env_steps"] == sum(results.env_steps().values()) - 3_200 > 3_200
+    assert 0 <= naive["share_reached"] <= 1
+    assert naive["auroc"] is None and naive["sources"] == {} and naive["curve"]["env_steps"] == [3_200]
+    assert found["random_return"]["some"] == found["random_return"]["all"] < found["expert_return"]["all"]
+    assert json.loads((whole / "made.json").read_bytes())["seconds"].keys() == RUNS
+
+
+def test_an_unchanged_table_computes_nothing(whole: Path) -> None:
+    before = {name: artifacts(whole / name) for name in RUNS}
+    results, events = (whole / "results.json").read_bytes(), (whole / "all-seed0" / "events.jsonl").read_text()
+    run(*command(whole.parent, 2))
+    assert (whole / "results.json").read_bytes() == results
+    assert {name: artifacts(whole / name) for name in RUNS} == before
+    added = (whole / "all-seed0" / "events.jsonl").read_text().removeprefix(events)
+    assert "run_started" in added and "stage_started" not in added
+
+
+@pytest.mark.parametrize(
+    ("job", "stage", "training", "workers", "workers_after"),
+    [("some-seed1", "imitation", "training-1", 2, 1), ("some-seed0", "imitators", "cluster-0", 1, 2)],
+)
+def test_killed_and_resumed_with_other_workers(
+    whole: Path, tmp_path: Path, job: str, stage: str, training: str, workers: int, workers_after: int
+) -> None:
+    write_experiment(tmp_path)
+    live = LiveRun(*command(tmp_path, workers))
+    wait_for(has_checkpoint(tmp_path / "micro" / job, stage, training, 2), "checkpoint")
+    live.kill_group()
+    nothing_left(live)
+    assert not (tmp_path / "micro" / "results.json").exists()
+    run(*command(tmp_path, workers_after))
+    assert (tmp_path / "micro" / "results.json").read_bytes() == (whole / "results.json").read_bytes()
+
+
+def test_an_interrupt_stops_politely(whole: Path, tmp_path: Path) -> None:
+    write_experiment(tmp_path)
+    live = LiveRun(*command(tmp_path, 2))
+    wait_for(has_checkpoint(tmp_path / "micro" / "some-seed0", "imitators", "cluster-0", 2), "checkpoint")
+    interrupt(live, signal.SIGINT)
+    code, output = live.finish()
+    assert code == 130, output
+    assert "4 not finished" in output and f"go on with: oodil table {tmp_path}" in output
+    nothing_left(live)
+    found = json.loads((tmp_path / "micro" / "results.json").read_bytes())
+    assert not found["cells"] and not found["failed"] and len(found["missing"]) == 8
+    # What is asked for is all that is computed; what is there already is shown.
+    run(*command(tmp_path, 1, "--rows", "all", "--methods", "naive_gail"))
+    assert len(json.loads((tmp_path / "micro" / "results.json").read_bytes())["cells"]) == 2
+    run(*command(tmp_path, 2))
+    assert (tmp_path / "micro" / "results.json").read_bytes() == (whole / "results.json").read_bytes()
+
+
+def test_what_runs_have_in_common_is_computed_once(tmp_path: Path) -> None:
+    """A method with overrides takes over all but its own policy, and has the bits of an ordinary run."""
+    variant = {"name": "kept", "policy": "imitation", "overrides": ["transferability.kept_from=0"]}
+    write_experiment(tmp_path, rows={"only": []}, methods=["imitation", variant], seeds=0, published={})
+    run(*command(tmp_path, 2))
+    computed: dict[str, list[str]] = {}
+    for name in ("only-seed0", "only-kept-seed0"):
+        events = map(json.loads, (tmp_path / "micro" / name / "events.jsonl").read_text().splitlines())
+        for event in events:
+            if event["event"] == "stage_started" and event["jobs"]:
+                computed.setdefault(event["stage"], []).append(name)
+    assert {stage: len(runs) for stage, runs in computed.items()} == {
+        "demonstrations": 1,
+        "clustering": 1,
+        "imitators": 1,
+        "transferability": 1,
+        "imitation": 2,
+    }
+    table = Table.of(load_experiment(tmp_path / "experiment.yaml"), tmp_path / "micro")
+    kept = next(planned for planned in table.runs if planned.name == "only-kept-seed0")
+    alone = oodil.run(kept.config, workers=0, run_dir=tmp_path / "alone")
+    assert artifacts(alone.path) == artifacts(tmp_path / "micro" / "only-kept-seed0")
+
+
+def test_one_that_fails_leaves_the_others_alone_and_is_named(tmp_path: Path) -> None:
+    never = "tests.raising:never"
+    write_experiment(tmp_path, rows={"only": [], "other": []}, methods=[never, "naive_gail"], seeds=0, published={})
+    code, output = LiveRun(*command(tmp_path, 2)).finish()
+    assert code == 1, output
+    assert "0 runs done, 2 failed (only-seed0, other-seed0), 0 not finished" in output
+    found = json.loads((tmp_path / "micro" / "results.json").read_bytes())
+    reason = "ArithmeticError: no weights today"
+    assert found["failed"] == [
+        {"row": row, "seed": 0, "method": "never", "reason": reason} for row in ("only", "other")
+    ]
+    assert [(cell["row"], cell["method"]) for cell in found["cells"]] == [
+        ("only", "naive_gail"),
+        ("other", "naive_gail"),
+    ]
+
+
+def test_another_configuration_is_refused(whole: Path) -> None:
+    write_experiment(whole.parent, overrides=[*SHORT, "imitation.gail.discount=0.9"])
+    before = (whole / "results.json").read_bytes()
+    code, output = LiveRun(*command(whole.parent, 1)).finish()
+    write_experiment(whole.parent)
+    assert code == 2, output
+    assert "is finished with other settings (gail.discount 0.995 -> 0.9); choose another --folder" in output
+    assert (whole / "results.json").read_bytes() == before
+
+
+def test_a_plan_computes_nothing(tmp_path: Path) -> None:
+    write_experiment(tmp_path)
+    output = run(*command(tmp_path, 1, "--plan", "--rows", "all"))
+    assert "2 runs: 12 stages to compute, 0 to take over, 0 finished" in output
+    assert "hours with 1 runs at once on this machine" in output
+    assert [path.name for path in tmp_path.iterdir()] == ["experiment.yaml"]
