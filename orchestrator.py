@@ -23,6 +23,7 @@ from oodil.pipeline.config import RunConfig
 from oodil.pipeline.environments import check_environment
 from oodil.pipeline.errors import ConfigError, DamagedArtifactError, StorageError, UnfinishedError
 from oodil.pipeline.loading import parse_config
+from oodil.pipeline.metrics import check_logger
 from oodil.pipeline.stage import Run, Stage, state_of
 from oodil.pipeline.stages import stages
 from oodil.pipeline.stages.demonstrations import check_demonstrations
@@ -108,11 +109,13 @@ def refuse_to_replace(run: Run, force: Collection[str]) -> None:
 
 
 def check_inputs(config: RunConfig) -> None:
-    """Refuse, before any work, an environment that cannot be made and demonstrations that cannot fit it."""
+    """Refuse, before any work, an environment that cannot be made, demonstrations that cannot fit it, and a logger
+    that is not there."""
     spec = check_environment(config.environment.id, config.environment.dynamics)
     for source in config.demonstrations.sources:
         check_environment(config.environment.id, source.dynamics)
     check_demonstrations(config, spec.observation_dim)
+    check_logger(config.runtime.logger)
 
 
 def choose(config: RunConfig, until: str | None = None) -> list[Stage]:

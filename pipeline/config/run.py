@@ -48,6 +48,9 @@ class RuntimeConfig(Section):
     """Restarts of rollout workers in one stage before it counts as failed."""
     restart_delay_s: float = Field(default=0.5, ge=0.0)
     """Pause before the first restart; it doubles with each further one, up to 10 s."""
+    logger: Literal["wandb", "trackio"] | None = None
+    """Also shows what jobs report there, on this machine alone unless WANDB_MODE or trackio's own variables say
+    otherwise; each job logs from its own process (docs/operations.md)."""
 
 
 _PAPER_GAIL: dict[str, Any] = {

@@ -14,6 +14,7 @@ from oodil.pipeline.datasets.foreign import read_any
 from oodil.pipeline.errors import DataError
 from oodil.pipeline.evaluation import evaluate as evaluate_policy
 from oodil.pipeline.loading import load_config
+from oodil.pipeline.metrics import check_logger
 from oodil.pipeline.results import Evaluation, Policy
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.scoring import Scored, check_dimension
@@ -160,6 +161,7 @@ def finetuning(
     }
     values["finetuning"] |= {"run": str(results.path.absolute()), "weighting": name}
     config = load_config(values, overrides)
+    check_logger(config.runtime.logger)
     path = results.path.absolute()
     return config, path.with_name(f"{path.name}-finetuned-{file.stem}-{name}")
 

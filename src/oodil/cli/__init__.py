@@ -49,6 +49,7 @@ for _command in (
     runs.status,
     runs.report,
     policies.evaluate,
+    policies.export_policy,
     policies.score,
     policies.finetune,
     runs.bench,
