@@ -17,8 +17,11 @@ FORCE, TIME_STEP, START = 2000.0, 0.05, 4.0
 class CartEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     """A cart to be brought to rest in the middle. Its mass, in kg, is what differs between robots."""
 
-    def __init__(self, mass: float = 900.0) -> None:
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 - as Gymnasium declares it
+
+    def __init__(self, mass: float = 900.0, render_mode: str | None = None) -> None:
         self.mass = mass
+        self.render_mode = render_mode
         self.action_space = Box(-FORCE, FORCE, (1,), np.float32)
         self.observation_space = Dict({name: Box(-np.inf, np.inf, (1,), np.float64) for name in ("place", "speed")})
         self._place = self._speed = 0.0
@@ -36,6 +39,14 @@ class CartEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self._speed += float(action[0]) / self.mass * TIME_STEP
         self._place += self._speed * TIME_STEP
         return self._observation(), -abs(self._place), False, False, {}
+
+    def render(self) -> np.ndarray:
+        """Return a picture (height, width, 3): the cart, and where it should come to rest."""
+        picture = np.full((96, 480, 3), 255, np.uint8)
+        picture[:, 239:241] = 160
+        at = int(240 + 24 * np.clip(self._place, -9, 9))
+        picture[40:72, at - 20 : at + 20] = (40, 90, 160)
+        return picture
 
     def _observation(self) -> dict[str, np.ndarray]:
         return {"place": np.array([self._place]), "speed": np.array([self._speed])}
