@@ -12,6 +12,7 @@ if __name__ == "__main__":
 
 import fcntl
 import json
+import shutil
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -69,8 +70,14 @@ def open_run(path: Path, config: RunConfig, force: Collection[str] = ()) -> Run:
         raise ConfigError(f"{path}: is not empty and not a run; choose another --run-dir")
     try:
         path.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(path).free
     except OSError as error:
         raise StorageError(f"{path}: {error.strerror or error}") from error
+    file = config.demonstrations.file
+    if file is not None and not directory.config.exists() and free < file.stat().st_size:
+        raise StorageError(
+            f"{path}: {free / 2**20:.1f} MiB are free, and a copy of {file} alone has {file.stat().st_size / 2**20:.1f}"
+        )
     write_file(directory.config, (config.model_dump_json(indent=2) + "\n").encode())
     return run
 

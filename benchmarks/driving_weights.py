@@ -27,7 +27,7 @@ from oodil.pipeline.runs import RunResults, separation_metrics
 from oodil.pipeline.seeding import derive_key, numpy_rng
 
 
-def world_of(dynamics: Mapping[str, float]) -> Layout:
+def world_of(dynamics: Mapping[str, Any]) -> Layout:
     """Return the world that an environment with these dynamics has."""
     keywords: dict[str, Any] = dict(dynamics)
     return DrivingEnv(**keywords).layout

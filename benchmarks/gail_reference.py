@@ -85,7 +85,7 @@ def demonstrations_of(task: Task, seed: int) -> Demonstrations:
     """Collect the demonstrations of a task."""
     return collect_demonstrations(
         None if task.expert == "hand-written" else load_expert(EXPERTS / task.expert)[0],
-        EnvironmentConfig(id=task.env_id, dynamics=task.demonstrator),
+        EnvironmentConfig(id=task.env_id, dynamics={**task.demonstrator}),
         0,
         task.count,
         seed,
@@ -119,7 +119,7 @@ def run_seed(name: str, dynamics: str, seed: int, config: GailConfig, keep: Path
         measuring += time.perf_counter() - begun
         return np.array([mean.mean_return, sampled.mean_return, float(np.exp(policy.log_std).mean())])
 
-    environment = EnvironmentConfig(id=task.env_id, dynamics=target)
+    environment = EnvironmentConfig(id=task.env_id, dynamics={**target})
     history = train(learner, environment, config, [Probe("return", CURVE_POINTS, measure)], Quiet(), UNUSED)
     seconds = time.perf_counter() - started - measuring
     steps, curve = history.steps("return"), history.values("return")

@@ -3,6 +3,7 @@
 Letters: T steps, G simulators of one env group, A action.
 """
 
+import json
 from collections import deque
 from collections.abc import Callable
 from functools import lru_cache
@@ -39,14 +40,14 @@ class RolloutSource(Protocol):
 
 
 @lru_cache(maxsize=4)
-def _groups(env_id: str, dynamics: tuple[tuple[str, float], ...], num_simulators: int) -> dict[int, Simulators]:
+def _groups(env_id: str, dynamics: str, num_simulators: int) -> dict[int, Simulators]:
     """Return the simulators of each group there was so far; those of the settings used last are kept."""
     return {}
 
 
 def _simulators(unit: Unit) -> Simulators:
     # One for each group, since some can go on much faster from where they stand.
-    groups = _groups(unit.env_id, unit.dynamics, unit.num_simulators)
+    groups = _groups(unit.env_id, json.dumps(unit.dynamics), unit.num_simulators)
     if unit.group not in groups:
         groups[unit.group] = make_batch(unit.env_id, dict(unit.dynamics), unit.num_simulators)
     return groups[unit.group]

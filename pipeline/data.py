@@ -7,6 +7,7 @@ Letters: N demonstrations, T states of one or steps of a rollout, G simulators, 
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,7 +178,8 @@ class Unit:
     iteration: int
     group: int
     env_id: str
-    dynamics: tuple[tuple[str, float], ...]
+    dynamics: tuple[tuple[str, Any], ...]
+    """Keyword arguments of the environment, values that JSON holds."""
     num_simulators: int
     num_steps: int
     policy_version: int

@@ -65,7 +65,7 @@ def run_episodes(
 def evaluate(
     policy: GaussianPolicy,
     env_id: str,
-    dynamics: Mapping[str, float],
+    dynamics: Mapping[str, Any],
     episodes: int,
     key: Key,
     *,
@@ -89,7 +89,7 @@ def distance_of(
     return reward.distance(run_episodes(simulators, policy, rng, stochastic=False, starts=starts))
 
 
-def film(policy: Policy, env_id: str, dynamics: Mapping[str, float], seed: int, path: Path) -> float:
+def film(policy: Policy, env_id: str, dynamics: Mapping[str, Any], seed: int, path: Path) -> float:
     """Film one deterministic episode as MP4 and return its true return.
 
     Raises UnusableEnvironmentError when nothing can be rendered here, with what is missing.
@@ -100,7 +100,7 @@ def film(policy: Policy, env_id: str, dynamics: Mapping[str, float], seed: int, 
         # Gymnasium tries GLFW first, which only fails once it has to draw.
         os.environ.setdefault("MUJOCO_GL", "egl" if ctypes.util.find_library("EGL") else "osmesa")
     try:
-        arguments: dict[str, Any] = {"render_mode": "rgb_array", **dynamics}
+        arguments: dict[str, Any] = {**dynamics, "render_mode": "rgb_array"}
         env = gymnasium.make(env_id, **arguments)
         observation, _ = env.reset(seed=seed)
         every = max(1, round(env.metadata["render_fps"] / FRAMES_PER_SECOND))

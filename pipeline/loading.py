@@ -2,6 +2,7 @@
 
 import copy
 import difflib
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -60,22 +61,51 @@ def load_config(
         if isinstance(source, RunConfig) and override.partition("=")[0] in ("preset", "clustering.preset"):
             raise ConfigError(f"override {override!r}: a configuration that is made leaves nothing open for a preset")
         apply_override(values, override)
+    _name_modules(values, base)
     return _resolve_paths(parse_config(values, origin), base)
 
 
 def parse_config(values: dict[str, Any], origin: str) -> RunConfig:
-    """Validate plain values. Raises ConfigError that names ``origin``, the key, the value and the nearest valid key."""
+    """Validate plain values. Raises ConfigError that names ``origin``, the key, the value and the nearest valid key.
+
+    Modules of its own can be imported from then on.
+    """
     try:
         config = RunConfig.model_validate(values)
     except ValidationError as error:
         problems = [_describe(problem) for problem in error.errors()]
         raise ConfigError("\n".join(f"{origin}: {problem}" for problem in problems)) from None
+    find_modules(config)
     try:
         for stage in stages(config):
             stage.check(config)
     except ConfigError as error:
         raise ConfigError(f"{origin}: {error}") from None
     return config
+
+
+def find_modules(config: RunConfig) -> None:
+    """Let this process import what the configuration names, from its own folder if it is not installed."""
+    if config.runtime.modules is not None:
+        find_modules_in(str(config.runtime.modules))
+
+
+def find_modules_in(folder: str) -> None:
+    """Let this process import modules that lie in a folder and are nowhere else."""
+    if folder not in sys.path:
+        sys.path.append(folder)  # At the end: a file of any name must not stand for what is installed.
+
+
+def _name_modules(values: dict[str, Any], base: Path) -> None:
+    """Make the folder of modules absolute; without one, that of the file if an environment or a baseline needs it."""
+    runtime, environment, baselines = (values.get(name) for name in ("runtime", "environment", "baselines"))
+    named = [environment.get("id") if isinstance(environment, dict) else None]
+    named += baselines if isinstance(baselines, list) else []
+    if runtime is not None and not isinstance(runtime, dict):
+        return
+    given = (runtime or {}).get("modules")
+    if isinstance(given, str) or any(isinstance(each, str) and ":" in each for each in named):
+        values["runtime"] = (runtime or {}) | {"modules": str(base / (given or "."))}
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

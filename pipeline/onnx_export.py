@@ -14,6 +14,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from oodil.pipeline.artifacts import write_file
 from oodil.pipeline.errors import ConfigError
+from oodil.pipeline.policy import action_units
 from oodil.pipeline.results import Policy
 
 OPSET, IR_VERSION = 17, 8
@@ -82,7 +83,10 @@ def _mean(graph: _Graph, policy: Policy) -> None:
 
 
 def _to_action_space(graph: _Graph, policy: Policy) -> None:
-    """Add what `Policy.act` makes of the network's (B, A) output: actions (B, ...) within their bounds."""
+    """Add what `Policy.act` makes of the network's (B, A) output: actions (B, ...) in the numbers of their space."""
+    middle, half = action_units(policy.action_low, policy.action_high)
     graph.then("Reshape", "shaped", shape=np.array([-1, *policy.action_low.shape], np.int64))
+    graph.then("Mul", "scaled", half=half)
+    graph.then("Add", "moved", middle=middle)
     graph.then("Max", "raised", low=policy.action_low)
     graph.then("Min", "action", high=policy.action_high)

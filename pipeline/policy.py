@@ -16,6 +16,27 @@ LARGEST_INPUT = 10.0
 """Where standardized inputs of networks are clipped, see `GaussianPolicy.input_limit`."""
 
 
+_UNBOUNDED = 1e30
+"""A bound as large as this is none."""
+
+
+def has_bounds(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Return which actions have two finite bounds; the others are not scaled."""
+    return (np.abs(low) < _UNBOUNDED) & (np.abs(high) < _UNBOUNDED)
+
+
+def action_units(
+    low: NDArray[np.floating], high: NDArray[np.floating]
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Return ``(middle, half)`` of the bounds of actions: an action of x in units is ``middle + half * x`` in numbers.
+
+    So what lies between two finite bounds is [-1, 1], and an action without them is taken as it is: 0 and 1.
+    """
+    bounded = has_bounds(low, high)
+    below, above = np.where(bounded, low, -1), np.where(bounded, high, 1)
+    return (below / 2 + above / 2).astype(low.dtype), (above / 2 - below / 2).astype(low.dtype)
+
+
 class Controller(Protocol):
     """Whatever acts: a policy, or a controller that somebody wrote."""
 

@@ -7,7 +7,7 @@ Letters: R trials, H steps, G simulators, L lengths, S observation, A action.
 """
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +58,7 @@ class Follower:
         """Steps of all simulators so far."""
         self._simulators = simulators
         self._iterations = iterations
-        low, high = (bound.astype(np.float64).ravel() for bound in (spec.action_low, spec.action_high))
+        low, high = (bound.astype(np.float64) for bound in spec.bounds())
         bounded = np.isfinite(low) & np.isfinite(high)
         self._middle = np.where(bounded, (low + high) / 2, 0.0)
         self._half = np.where(bounded, (high - low) / 2, 1.0)
@@ -208,4 +208,7 @@ def _rows(snapshot: Snapshot, rows: NDArray[np.intp]) -> Snapshot:
 
 
 def _joined(parts: list[Snapshot]) -> Snapshot:
-    return Snapshot(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Snapshot)))
+    # Some states are as long as what was played, and zeros behind that mean nothing.
+    width = max(part.states.shape[1] for part in parts)
+    wide = [replace(part, states=np.pad(part.states, ((0, 0), (0, width - part.states.shape[1])))) for part in parts]
+    return Snapshot(*(np.concatenate([getattr(part, field.name) for part in wide]) for field in fields(Snapshot)))

@@ -27,6 +27,7 @@ from oodil.workers.messages import MAX_FRAME_BYTES
 
 _QUEUE_LIMIT = 64
 """Messages waiting per peer and direction; a worker holds two units, so only a defect reaches it."""
+_SOCKET = "learner"
 _MAX_PATH = 100
 """Operating systems allow 104 (macOS) to 108 (Linux) bytes for the path of a socket."""
 _BATCH = 64
@@ -63,16 +64,22 @@ def endpoint_folder(run_path: Path) -> Path:
     return Path(tempfile.gettempdir()) / f"oodil-{os.getuid()}-{digest}"
 
 
+def refuse_long_path(run_path: Path) -> None:
+    """Raise EndpointError if the path of a run's socket would be too long; it is as long for every run."""
+    socket = endpoint_folder(run_path) / _SOCKET
+    if len(os.fsencode(socket)) > _MAX_PATH:
+        raise EndpointError(f"{socket} is too long for a socket; set TMPDIR to a folder with a shorter path")
+
+
 @contextmanager
 def private_endpoint(run_path: Path) -> Iterator[str]:
     """Make the folder of a run's socket, empty and closed to other users, and remove it at the end.
 
     Raises EndpointError if something else is there, or if the path is too long for a socket.
     """
+    refuse_long_path(run_path)
     folder = endpoint_folder(run_path)
-    socket = folder / "learner"
-    if len(os.fsencode(socket)) > _MAX_PATH:
-        raise EndpointError(f"{socket} is too long for a socket; set TMPDIR to a folder with a shorter path")
+    socket = folder / _SOCKET
     _remove(folder)
     folder.mkdir(mode=0o700)
     try:

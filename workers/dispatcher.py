@@ -7,6 +7,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 
 from oodil.pipeline.data import Unit, UnitResult
+from oodil.pipeline.errors import UnusableEnvironmentError
 
 UNITS_PER_WORKER = 2
 """One in work and one waiting, so that a worker never waits for the learner's answer."""
@@ -96,12 +97,17 @@ class Dispatcher:
         self._results.setdefault(result.iteration, []).append(result)
         self._homes[result.group] = worker
 
-    def failed(self, worker: str, name: UnitName, traceback: str, now: float) -> None:
-        """Note that a unit raised; another worker gets it. Raises CollectError when that happened too often."""
+    def failed(self, worker: str, name: UnitName, traceback: str, now: float, is_final: bool = False) -> None:
+        """Note that a unit raised; another worker gets it.
+
+        Raises CollectError when that happened too often, and UnusableEnvironmentError for a failure that is final.
+        """
         self._answered(worker, name, now)
         if name not in self._units:
             self.dropped["duplicate"] += 1
             return
+        if is_final:
+            raise UnusableEnvironmentError(traceback)
         failures = self._failures.setdefault(name, {})
         failures[worker] = failures.get(worker, 0) + 1
         if sum(failures.values()) >= MAX_FAILURES:

@@ -125,14 +125,16 @@ class JobLedger:
             self.stopped = True
         self._on_event(Event(job, Finished(outcome)))
 
-    def failed(self, job: str, reason: str) -> float | None:
+    def failed(self, job: str, reason: str, is_final: bool = False) -> float | None:
         """Note that the current attempt failed; return the pause before the next one, or None if it was the last."""
         attempts = self._attempts[job]
         delay_s = attempts.failed(reason)
+        if is_final:
+            delay_s = None
         if self.stopped:
             delay_s = None
         elif delay_s is None:
-            self._failed[job] = attempts.first_reason
+            self._failed[job] = reason if is_final else attempts.first_reason
         self._on_event(Event(job, AttemptFailed(attempts.number, reason, delay_s is not None)))
         return delay_s
 

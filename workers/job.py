@@ -8,6 +8,7 @@ from pathlib import Path
 from oodil.pipeline.artifacts import RunDirectory, write_artifact
 from oodil.pipeline.collecting import InlineRollouts, RolloutSource
 from oodil.pipeline.config import RunConfig
+from oodil.pipeline.loading import find_modules
 from oodil.pipeline.metrics import Logger, Metrics
 from oodil.pipeline.stage import JobStoppedError, Run, Stage, stage_named
 from oodil.pipeline.versions import library_versions
@@ -99,6 +100,7 @@ def open_stage(run_path: str, name: str, module: str) -> tuple[Stage, Run]:
     """Return a stage, which importing ``module`` registers, and the run in a folder."""
     directory = RunDirectory(Path(run_path))
     config = RunConfig.model_validate_json(directory.config.read_text())
+    find_modules(config)
     return stage_named(name, module), Run(config, directory)
 
 

@@ -1,11 +1,11 @@
 """The engine of one machine: jobs in processes of their own, or one after another in this one."""
 
 import time
-import traceback
 import uuid
 from collections import deque
 from contextlib import nullcontext
 from functools import partial
+from pathlib import Path
 
 from oodil.pipeline.collecting import InlineRollouts
 from oodil.pipeline.config import RuntimeConfig
@@ -13,9 +13,9 @@ from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.stage import Run, Stage
 from oodil.workers import job as job_process
 from oodil.workers import rollout_worker
-from oodil.workers.channels import Access, private_endpoint
+from oodil.workers.channels import Access, private_endpoint, refuse_long_path
 from oodil.workers.engine import POLL_S, Attempts, JobLedger, OnEvent, Outcome, ShouldStop, refuse_main
-from oodil.workers.reports import Event, Failed, Finished, Progress, Replaced, Silent, Started, Warn
+from oodil.workers.reports import Event, Failed, Finished, Progress, Replaced, Silent, Started, Warn, failure
 from oodil.workers.supervisor import Supervisor
 
 _WORKER = "rollout-worker-"
@@ -36,12 +36,14 @@ class LocalEngine:
 
     A distributed stage has one learner process, and ``workers`` rollout workers beside it, unless it has as many jobs
     as there are workers; with ``access`` others may join them from elsewhere (`oodil.workers.remote`). Raises
-    ConfigError for a negative number of workers.
+    ConfigError for a negative number of workers, and EndpointError if TMPDIR is too long for a socket.
     """
 
     def __init__(self, workers: int, access: Access | None = None) -> None:
         if workers < 0:
             raise ConfigError(f"workers is {workers}; it cannot be negative")
+        if workers:
+            refuse_long_path(Path())
         self._workers = workers
         self._access = access
         """Where rollout workers of other machines may join, if they may."""
@@ -93,8 +95,9 @@ def _attempt_inline(stage: Stage, run: Run, job: str, ledger: JobLedger, should_
     ledger.begin(job)
     try:
         outcome = job_process.run_job(stage, run, job, InlineRollouts(), partial(ledger.report, job), should_stop)
-    except Exception:
-        return ledger.failed(job, traceback.format_exc())
+    except Exception as error:
+        failed = failure(error)
+        return ledger.failed(job, failed.reason, failed.is_final)
     ledger.finished(job, outcome)
     return None
 
@@ -173,9 +176,9 @@ class _Processes:
             case Finished(outcome):
                 self._forget(job)
                 self._ledger.finished(job, outcome)
-            case Failed(reason):
+            case Failed(reason, is_final):
                 self._forget(job)
-                delay_s = self._ledger.failed(job, reason)
+                delay_s = self._ledger.failed(job, reason, is_final)
                 if delay_s is not None:
                     self._start_job(job, delay_s)
             case Silent(worker):

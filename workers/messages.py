@@ -23,16 +23,17 @@ from oodil.workers.wire import (
     Readers,
     brief,
     count,
+    flag,
     items,
     key,
-    numbers_by_name,
     pack,
     read,
     text,
     unpack,
+    values_by_name,
 )
 
-SCHEMA = 3
+SCHEMA = 4
 """Raise it when the meaning of a message changes; other versions are refused."""
 MAX_FRAMES = 64
 MAX_FRAME_BYTES = 256 * 1024 * 1024
@@ -98,6 +99,8 @@ class UnitFailure:
     iteration: int
     group: int
     traceback: str
+    is_final: bool = False
+    """Whether nobody should try again: the environment cannot be used, and instead of a traceback it is said why."""
 
 
 Message = Ready | Refused | UnitMessage | ResultMessage | UnitFailure
@@ -108,7 +111,7 @@ _UNIT: Readers = {
     "iteration": count,
     "group": count,
     "env_id": text,
-    "dynamics": numbers_by_name,
+    "dynamics": values_by_name,
     "num_simulators": count,
     "num_steps": count,
     "policy_version": count,
@@ -119,7 +122,7 @@ _FIELDS: dict[str, Readers] = {
     "Refused": {"reason": text},
     "UnitMessage": _UNIT,
     "ResultMessage": {"iteration": count, "group": count, "policy_version": count},
-    "UnitFailure": {"iteration": count, "group": count, "traceback": text},
+    "UnitFailure": {"iteration": count, "group": count, "traceback": text, "is_final": flag},
 }
 Arrays = dict[str, NDArray]
 

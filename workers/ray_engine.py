@@ -10,7 +10,6 @@ import faulthandler
 import ipaddress
 import os
 import time
-import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,14 +22,15 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from oodil.pipeline.collecting import Follow, InlineRollouts, collect, nothing_follows
 from oodil.pipeline.data import Unit, UnitResult
 from oodil.pipeline.errors import ConfigError
+from oodil.pipeline.loading import find_modules_in
 from oodil.pipeline.stage import Run, Stage
 from oodil.pipeline.versions import collecting_versions
 from oodil.workers import job as job_process
 from oodil.workers.engine import POLL_S, JobLedger, OnEvent, Outcome, ShouldStop, refuse_main
 from oodil.workers.messages import Header, ResultMessage, UnitMessage, decode, encode
-from oodil.workers.reports import STOPPED, Failed, Finished, Report, decode_report, encode_report
+from oodil.workers.reports import STOPPED, Failed, Finished, Report, decode_report, encode_report, failure
 from oodil.workers.threads import limit_this_process
-from oodil.workers.wire import MessageError, shortened
+from oodil.workers.wire import MessageError
 
 _LOST = "its process or its node is gone"
 _HEADER = Header("", "", "ray", 0)
@@ -110,7 +110,7 @@ class RayEngine:
                     if isinstance(words, Finished):
                         ledger.finished(job, words.outcome)
                         continue
-                    delay_s = ledger.failed(job, words.reason)
+                    delay_s = ledger.failed(job, words.reason, words.is_final)
                     if delay_s is not None:
                         due[job] = time.monotonic() + delay_s
         finally:
@@ -204,23 +204,27 @@ def _run_job(board: Any, run_path: str, stage_name: str, module: str, job: str) 
     """The task of a job; returns its last report."""
     stage, run = job_process.open_stage(run_path, stage_name, module)
     runtime = run.config.runtime
-    rollouts = RayRollouts(runtime.unit_timeout_s) if stage.distributed else InlineRollouts()
+    rollouts = (
+        RayRollouts(runtime.unit_timeout_s, str(runtime.modules or "")) if stage.distributed else InlineRollouts()
+    )
     with _ended_after(runtime.job_timeout_s) as reset_timer:
         writer = _Writer(board, job, reset_timer)
         if writer.should_stop():
             return encode_report(Finished(STOPPED))
         try:
             outcome = job_process.run_job(stage, run, job, rollouts, writer.send, writer.should_stop)
-        except Exception:
-            return encode_report(Failed(shortened(traceback.format_exc())))
+        except Exception as error:
+            return encode_report(failure(error))
         return encode_report(Finished(outcome))
 
 
 class RayRollouts:
     """A rollout source whose units are Ray tasks. Ray runs a unit again wherever it was lost."""
 
-    def __init__(self, unit_timeout_s: float) -> None:
+    def __init__(self, unit_timeout_s: float, modules: str = "") -> None:
         self._unit_timeout_s = unit_timeout_s
+        self._modules = modules
+        """Folder of modules that a unit's environment may be in."""
         self._collect = ray.remote(_collect).options(max_retries=-1)
         self._versions = collecting_versions()
         self._answers: dict[Any, int] = {}
@@ -230,7 +234,9 @@ class RayRollouts:
         """Hand over units, each as a task."""
         for unit in units:
             frames = encode(UnitMessage(_HEADER, unit))
-            self._answers[self._collect.remote(self._versions, frames, self._unit_timeout_s)] = unit.iteration
+            self._answers[self._collect.remote(self._versions, frames, self._unit_timeout_s, self._modules)] = (
+                unit.iteration
+            )
 
     def gather(self, follow: Follow = nothing_follows) -> list[UnitResult]:
         """Wait for the iteration that was submitted first, see `RolloutSource`; raises what collecting raised."""
@@ -248,10 +254,12 @@ class RayRollouts:
         return sorted(results, key=lambda result: result.group)
 
 
-def _collect(versions: str, frames: list[bytes], timeout_s: float) -> list[bytes]:
+def _collect(versions: str, frames: list[bytes], timeout_s: float, modules: str) -> list[bytes]:
     """The task of a unit: the frames of a UnitMessage in, those of a ResultMessage out."""
     limit_this_process()
     _refuse_other_versions(versions)
+    if modules:
+        find_modules_in(modules)
     message = decode(frames)
     if not isinstance(message, UnitMessage):
         raise MessageError(f"asked to collect {type(message).__name__}")

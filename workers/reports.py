@@ -5,9 +5,24 @@ about; whoever watches a run gets events whose reports are those of the job itse
 that only an engine can make.
 """
 
+import traceback
 from dataclasses import dataclass
 
-from oodil.workers.wire import MessageError, Readers, brief, count, items, numbers_by_name, pack, read, text, unpack
+from oodil.pipeline.errors import UnusableEnvironmentError
+from oodil.workers.wire import (
+    MessageError,
+    Readers,
+    brief,
+    count,
+    flag,
+    items,
+    numbers_by_name,
+    pack,
+    read,
+    shortened,
+    text,
+    unpack,
+)
 
 DONE, STOPPED = "done", "stopped"
 """Outcomes of a job: its artifact is written; it wrote a checkpoint and stopped because it was asked to."""
@@ -59,6 +74,8 @@ class Failed:
     """It raised, or it died, which its parent finds out; ``reason`` is its traceback if there is one."""
 
     reason: str
+    is_final: bool = False
+    """Whether it should not be tried again: the environment cannot be used, and the reason is one message."""
 
 
 Report = Stop | Progress | Warn | Silent | Finished | Failed
@@ -100,13 +117,19 @@ class Event:
     report: Report | Started | AttemptFailed | Replaced
 
 
+def failure(error: BaseException) -> Failed:
+    """Return the last words of what raised an error that is being handled."""
+    is_final = isinstance(error, UnusableEnvironmentError)
+    return Failed(shortened(str(error) if is_final else traceback.format_exc()), is_final)
+
+
 _REPORTS: dict[type[Report], Readers] = {
     Stop: {},
     Progress: {"done": count, "total": count, "metrics": numbers_by_name},
     Warn: {"text": text},
     Silent: {"worker": text},
     Finished: {"outcome": text},
-    Failed: {"reason": text},
+    Failed: {"reason": text, "is_final": flag},
 }
 
 

@@ -10,8 +10,9 @@ from oodil.pipeline.collecting import collect
 from oodil.pipeline.versions import collecting_versions
 from oodil.workers.channels import Dealer
 from oodil.workers.messages import Header, Ready, Refused, ResultMessage, UnitFailure, UnitMessage, decode, encode
+from oodil.workers.reports import failure
 from oodil.workers.supervisor import Link
-from oodil.workers.wire import MessageError, shortened
+from oodil.workers.wire import MessageError
 
 READY_INTERVAL_S = 1.0
 _POLL_S = 0.1
@@ -60,7 +61,7 @@ def _serve(channel: Dealer, link: Link, name: str, run_id: str) -> str:
 def _answer(message: UnitMessage, header: Header) -> list[bytes]:
     try:
         return encode(ResultMessage(header, collect(message.unit)))
-    except Exception:
-        text = traceback.format_exc()
-        logging.error("unit %d/%d failed\n%s", message.unit.iteration, message.unit.group, text)
-        return encode(UnitFailure(header, message.unit.iteration, message.unit.group, shortened(text)))
+    except Exception as error:
+        unit, failed = message.unit, failure(error)
+        logging.error("unit %d/%d failed\n%s", unit.iteration, unit.group, traceback.format_exc())
+        return encode(UnitFailure(header, unit.iteration, unit.group, failed.reason, failed.is_final))

@@ -23,8 +23,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from oodil.workers.fork_server import Connection, Process, fork_server, wait
-from oodil.workers.reports import Event, Failed, Finished, Report, Started, Stop, decode_report, encode_report
-from oodil.workers.wire import MessageError, shortened
+from oodil.workers.reports import Event, Failed, Finished, Report, Started, Stop, decode_report, encode_report, failure
+from oodil.workers.wire import MessageError
 
 _MAX_REPORT_BYTES = 1024 * 1024
 _TERMINATE_S = 2.0
@@ -267,10 +267,9 @@ def _child_main(link: int, server: int, log: str, identity: str, main: str, argu
         called: Main = getattr(importlib.import_module(module), function)
         parent.send(Finished(called(parent, **arguments)))
         exit_code = 0
-    except BaseException:
-        text = traceback.format_exc()
-        logging.error("%s", text)
-        parent.send(Failed(shortened(text)))
+    except BaseException as error:
+        logging.error("%s", traceback.format_exc())
+        parent.send(failure(error))
         exit_code = 1
     # What a library does at the end of the interpreter must not undo what was reported.
     sys.stdout.flush()

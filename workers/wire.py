@@ -11,7 +11,7 @@ import msgpack
 MAX_HEADER_BYTES = 64 * 1024
 MAX_TEXT = 32 * 1024
 """Characters of a string; longer tracebacks lose their middle."""
-_MAX_ITEMS = 256
+_MAX_ITEMS, _MAX_DEPTH = 16_384, 16
 
 Readers = dict[str, Callable[[Any], Any]]
 """The fields of something that travels, and what reads the value of each."""
@@ -48,6 +48,13 @@ def text(value: Any) -> str:
     return value
 
 
+def flag(value: Any) -> bool:
+    """Read a truth value."""
+    if type(value) is not bool:
+        raise MessageError(f"expected a truth value, found {brief(value)}")
+    return value
+
+
 def key(value: Any) -> tuple[int, ...]:
     """Read a random key."""
     return tuple(count(part) for part in items(value))
@@ -58,6 +65,23 @@ def numbers_by_name(value: Any) -> dict[str, float]:
     if type(value) is not dict:
         raise MessageError(f"expected numbers by name, found {brief(value)}")
     return {text(name): number(figure) for name, figure in value.items()}
+
+
+def values_by_name(value: Any) -> dict[str, Any]:
+    """Read what JSON holds by name."""
+    if type(value) is not dict:
+        raise MessageError(f"expected values by name, found {brief(value)}")
+    return {text(name): _plain(each, _MAX_DEPTH) for name, each in value.items()}
+
+
+def _plain(value: Any, depth: int) -> Any:
+    if not depth:
+        raise MessageError(f"values in more than {_MAX_DEPTH} others")
+    if type(value) is dict:
+        return {text(name): _plain(each, depth - 1) for name, each in value.items()}
+    if type(value) is list:
+        return [_plain(each, depth - 1) for each in value]
+    return value if value is None or type(value) in (bool, int, float) else text(value)
 
 
 def items(value: Any) -> list[Any]:

@@ -152,7 +152,9 @@ class ZmqRollouts:
             self._dispatcher.result(worker, message.result, now)
             self._last_result = now
         elif isinstance(message, UnitFailure):
-            self._dispatcher.failed(worker, (message.iteration, message.group), message.traceback, now)
+            self._dispatcher.failed(
+                worker, (message.iteration, message.group), message.traceback, now, message.is_final
+            )
 
     def _admit(self, worker: str, versions: str) -> None:
         """Accept a worker, unless its libraries could give other bits than ours."""

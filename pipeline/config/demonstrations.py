@@ -5,7 +5,7 @@ from typing import Literal
 
 from pydantic import Field, PositiveInt, model_validator
 
-from oodil.pipeline.config.sections import Section, UnitInterval
+from oodil.pipeline.config.sections import Dynamics, Section, UnitInterval
 
 
 class SourceConfig(Section):
@@ -13,8 +13,8 @@ class SourceConfig(Section):
 
     label: str
     """Its name in reports."""
-    dynamics: dict[str, float] = Field(default={})
-    """Keyword arguments of the environment: the demonstrator's own dynamics."""
+    dynamics: Dynamics = Field(default={})
+    """Keyword arguments of the environment: the demonstrator's own dynamics; see `environment.dynamics`."""
     expert: Literal["hand-written"] | Path
     """Folder of a saved expert, relative to the configuration file, or the controller that the environment brings."""
     expert_discount: UnitInterval = 0.995

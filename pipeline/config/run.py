@@ -1,8 +1,9 @@
 """The configuration of a whole run, and the presets of it."""
 
+from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, PositiveFloat, PositiveInt, ValidationInfo, field_validator, model_validator
 
 from oodil.pipeline.config.clustering import CLUSTERING_PRESETS, ClusteringConfig
 from oodil.pipeline.config.demonstrations import DemonstrationsConfig
@@ -14,7 +15,7 @@ from oodil.pipeline.config.methods import (
     ReproducibilityConfig,
     TransferabilityConfig,
 )
-from oodil.pipeline.config.sections import EnvironmentConfig, Section
+from oodil.pipeline.config.sections import EnvironmentConfig, Section, dynamics_of
 
 
 class EvaluationConfig(Section):
@@ -48,6 +49,9 @@ class RuntimeConfig(Section):
     """Restarts of rollout workers in one stage before it counts as failed."""
     restart_delay_s: float = Field(default=0.5, ge=0.0)
     """Pause before the first restart; it doubles with each further one, up to 10 s."""
+    modules: Path | None = None
+    """Folder of the modules that `environment.id` and `baselines` name, where they are not installed; that of the
+    configuration file unless something else is said, and relative to it."""
     logger: Literal["wandb", "trackio"] | None = None
     """Also shows what jobs report there, on this machine alone unless WANDB_MODE or trackio's own variables say
     otherwise; each job logs from its own process (docs/operations.md)."""
@@ -121,6 +125,17 @@ class RunConfig(Section):
     """What is measured beside the training."""
     runtime: RuntimeConfig = RuntimeConfig()
     """How it runs."""
+
+    @field_validator("demonstrations")
+    @classmethod
+    def _dynamics_as_given(cls, section: DemonstrationsConfig, info: ValidationInfo) -> DemonstrationsConfig:
+        environment: EnvironmentConfig | None = info.data.get("environment")
+        if environment is None:
+            return section
+        sources = [
+            each.model_copy(update={"dynamics": dynamics_of(environment.id, each.dynamics)}) for each in section.sources
+        ]
+        return section.model_copy(update={"sources": tuple(sources)})
 
     @property
     def cluster_steps(self) -> int:

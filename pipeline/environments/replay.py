@@ -1,173 +1,142 @@
 """Any deterministic Gymnasium environment, its inner state unknown: a snapshot is a start and the actions since.
 
-Restoring plays an episode again from its start. That is as slow as it sounds, so a batch that stands where it is asked
-to go does nothing; workers keep one batch per env group, and a group tends to stay with its worker.
+Restoring plays an episode again from its start, and sees that it is the same one. That is as slow as it sounds, so a
+batch that stands where it is asked to go does nothing; workers keep one batch per env group, and a group tends to stay
+with its worker.
 
-Letters: G simulators, S observation, A action, H steps of the longest episode.
+Letters: G simulators, S observation, A action.
 """
 
-from typing import Any
+import time
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from oodil.pipeline.data import Snapshot
 from oodil.pipeline.environments.batch import StepOutcome
+from oodil.pipeline.environments.foreign import ForeignEnvironment
 from oodil.pipeline.errors import UnusableEnvironmentError
 
-_TRIAL_STEPS = 20
-
-
-def box_spaces(env: gymnasium.Env[Any, Any]) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """Return observation and action space. Raises ValueError unless both are boxes."""
-    seen, action = env.observation_space, env.action_space
-    for what, space in (("observation", seen), ("action", action)):
-        if not isinstance(space, gymnasium.spaces.Box):
-            raise ValueError(f"the {what} space is {space}; only Box spaces can be used")
-    assert isinstance(seen, gymnasium.spaces.Box) and isinstance(action, gymnasium.spaces.Box)
-    return seen, action
-
-
-def can_be_placed(env: gymnasium.Env[Any, Any]) -> bool:
-    """Return whether an environment has a method ``place(observation)``, which returns what it then observes."""
-    return hasattr(env.unwrapped, "place")
-
-
-def unplaceable(env_id: str) -> str:
-    """Say that an environment cannot be placed."""
-    return f"environment {env_id!r} cannot be put into an observed state: its class has no method place(observation)"
+_TRIAL_SPREADS = (1.0, 0.3, 0.0)
+"""Of the actions of each episode of a trial; robots fall soon under large ones."""
+_TRIAL_STEPS, _TRIAL_S = 10_000, 4.0
+"""What is played before it is played again, at most."""
+_LONGEST_WITHOUT_END = 100_000
+"""Time limit in steps of an environment of which no trial came to an end."""
 
 
 class ReplayBatch:
     """G Gymnasium environments side by side; the caller decides when an ended one is reset.
 
-    An environment that has ended stays where it is, whatever its action, until it is reset.
+    An environment that has ended stays where it is, whatever its action, until it is reset. Actions are in units of the
+    action space. Of the episodes that are over, the 1st, 2nd, 4th, 8th and so on are played once more: whatever
+    does not come out the same raises UnusableEnvironmentError.
     """
 
-    def __init__(self, environments: list[gymnasium.Env[Any, Any]], max_episode_steps: int) -> None:
-        """Take over environments of one kind. Raises ValueError unless both spaces are boxes."""
+    def __init__(self, environments: list[ForeignEnvironment], max_episode_steps: int) -> None:
+        """Take over environments of one kind."""
         self._environments = environments
         self.num_simulators = len(environments)
         self.max_episode_steps = max_episode_steps
-        seen, action = box_spaces(environments[0])
-        self._actions = action
-        self.observation_dim = int(np.prod(seen.shape))
-        self.action_dim = int(np.prod(action.shape))
-        self._observations = np.zeros((self.num_simulators, self.observation_dim))
-        # A row is a seed and then every action since, as far as there are any. One that can be placed has room in
-        # between for where it was placed; its seed is -1 then.
-        self._before_actions = 1 + self.observation_dim * can_be_placed(environments[0])
-        self._history = np.zeros((self.num_simulators, self._before_actions + max_episode_steps * self.action_dim))
-        self._elapsed = np.zeros(self.num_simulators, np.int64)
-        self._returns = np.zeros(self.num_simulators)
-        self._terminated = np.zeros(self.num_simulators, np.bool_)
-        self._truncated = np.ones(self.num_simulators, np.bool_)
+        self.observation_dim = environments[0].observation_dim
+        self.action_dim = environments[0].action_dim
+        self._episodes = 0
 
     def observations(self) -> NDArray[np.float64]:
         """Return (G, S) observations of the present states, flattened."""
-        return self._observations.copy()
+        return np.stack([each.observation for each in self._environments])
 
     def reset(self, simulator: int, seed: int) -> None:
         """Start a new episode in one environment with a seed of at most 2**53."""
-        observation, _ = self._environments[simulator].reset(seed=seed)
-        self._begin(simulator, observation)
-        self._history[simulator, 0] = seed
+        self._look_again(simulator)
+        self._environments[simulator].reset(seed)
 
     def place(self, simulator: int, observation: NDArray[np.floating]) -> None:
         """Start a new episode in one environment, put where (S,) is observed by its own method ``place``.
 
         Raises UnusableEnvironmentError if it has none.
         """
-        env = self._environments[simulator]
-        if not can_be_placed(env):
-            raise UnusableEnvironmentError(unplaceable(env.spec.id if env.spec is not None else str(env.unwrapped)))
-        env.reset(seed=0)  # Wrappers count an episode's steps from its reset.
-        task: Any = env.unwrapped
-        wanted = observation.astype(np.float64)
-        self._begin(simulator, task.place(wanted.reshape(env.observation_space.shape or ())))
-        self._history[simulator, 0] = -1
-        self._history[simulator, 1 : self._before_actions] = wanted
+        self._look_again(simulator)
+        self._environments[simulator].place(observation.astype(np.float64))
 
     def tells_state(self, observations: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return (N,) that all do: an environment with a method ``place`` says so by having it."""
         return np.ones(len(observations), np.bool_)
 
-    def _begin(self, simulator: int, observation: Any) -> None:
-        self._observations[simulator] = np.asarray(observation, np.float64).ravel()
-        self._history[simulator] = 0
-        self._elapsed[simulator] = 0
-        self._returns[simulator] = 0.0
-        self._terminated[simulator] = self._truncated[simulator] = False
-
     def step(self, actions: NDArray[np.floating]) -> StepOutcome:
         """Apply (G, A) actions, clipped to the action space, in every environment that has not ended."""
         rewards = np.zeros(self.num_simulators)
-        for i in np.flatnonzero(~(self._terminated | self._truncated)).tolist():
-            rewards[i] = self._advance(i, actions[i].astype(np.float32))
-        return StepOutcome(rewards, self._terminated.copy(), self._truncated.copy())
+        for i in np.flatnonzero(~self._ended()).tolist():
+            rewards[i] = self._environments[i].step(actions[i].astype(np.float32))
+        terminated = np.array([each.terminated for each in self._environments])
+        return StepOutcome(rewards, terminated, self._truncated())
 
     def elapsed_steps(self) -> NDArray[np.int64]:
         """Return (G,) steps since the last reset of each environment."""
-        return self._elapsed.copy()
+        return np.array([each.elapsed for each in self._environments], np.int64)
 
     def episode_returns(self) -> NDArray[np.float64]:
         """Return (G,) sums of the environment's own reward since the last reset; for evaluation only."""
-        return self._returns.copy()
+        return np.array([each.env_return for each in self._environments])
 
     def snapshot(self) -> Snapshot:
         """Save all environments; `restore` continues from here to the same bits."""
-        return Snapshot(self._history.copy(), self._elapsed.copy(), self._returns.copy())
+        histories = [each.history() for each in self._environments]
+        states = np.zeros((self.num_simulators, max(map(len, histories))))
+        for row, history in zip(states, histories, strict=True):
+            row[: len(history)] = history
+        return Snapshot(states, self.elapsed_steps(), self.episode_returns())
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Continue from a snapshot of a batch of the same size, playing again what is not there yet."""
-        if snapshot.states.shape != self._history.shape:
-            raise ValueError(
-                f"snapshot holds histories of shape {snapshot.states.shape}; this batch needs {self._history.shape}"
-            )
-        for i, (history, elapsed) in enumerate(zip(snapshot.states, snapshot.elapsed_steps.tolist(), strict=True)):
-            if elapsed == self._elapsed[i] and history.tobytes() == self._history[i].tobytes():
-                continue
-            if history[0] < 0:
-                self.place(i, history[1 : self._before_actions])
-            else:
-                self.reset(i, seed=int(history[0]))
-            for action in history[self._before_actions :].reshape(-1, self.action_dim)[:elapsed]:
-                self._advance(i, action.astype(np.float32))
+        """Continue from a snapshot of a batch of the same size, playing again what is not there yet.
 
-    def _advance(self, simulator: int, action: NDArray[np.float32]) -> float:
-        elapsed = int(self._elapsed[simulator])
-        begin = self._before_actions + elapsed * self.action_dim
-        self._history[simulator, begin : begin + self.action_dim] = action
-        space = self._actions
-        clipped = np.clip(action.reshape(space.shape), space.low, space.high).astype(space.dtype)
-        observation, reward, terminated, truncated, _ = self._environments[simulator].step(clipped)
-        seen = np.asarray(observation, np.float64).ravel()
-        if not np.isfinite(seen).all():
-            raise FloatingPointError(f"step {elapsed + 1} of an episode gave an observation that is not finite: {seen}")
-        self._observations[simulator] = seen
-        self._elapsed[simulator] += 1
-        self._returns[simulator] += float(reward)
-        self._terminated[simulator] = terminated
-        self._truncated[simulator] = truncated or elapsed + 1 >= self.max_episode_steps
-        return float(reward)
+        Raises UnusableEnvironmentError if an episode differs from what was seen.
+        """
+        if len(snapshot.states) != self.num_simulators:
+            raise ValueError(f"snapshot holds {len(snapshot.states)} histories; this batch has {self.num_simulators}")
+        rows = zip(self._environments, snapshot.states, snapshot.elapsed_steps.tolist(), strict=True)
+        for environment, history, elapsed in rows:
+            if not environment.stands_at(history, elapsed):
+                environment.replay(history, elapsed)
+
+    def _truncated(self) -> NDArray[np.bool_]:
+        return np.array([each.truncated or each.elapsed >= self.max_episode_steps for each in self._environments])
+
+    def _ended(self) -> NDArray[np.bool_]:
+        return np.array([each.terminated for each in self._environments]) | self._truncated()
+
+    def _look_again(self, simulator: int) -> None:
+        """Play the episode that is over once more, ever more seldom."""
+        environment = self._environments[simulator]
+        if environment.elapsed:
+            self._episodes += 1
+            if not self._episodes & (self._episodes - 1):
+                environment.replay(environment.history(), environment.elapsed)
 
 
-def refuse_randomness(batch: ReplayBatch, env_id: str) -> None:
-    """Raise UnusableEnvironmentError if the same seed and actions can lead to different states."""
-    rng = np.random.default_rng(0)
-    actions = rng.standard_normal((_TRIAL_STEPS, 1, batch.action_dim), dtype=np.float32)
-    traces = []
-    for _ in range(2):
-        batch.reset(0, seed=1)
-        trace = [batch.observations()[:1]]
-        for action in actions:
-            batch.step(np.repeat(action, batch.num_simulators, axis=0))
-            trace.append(batch.observations()[:1])
-        traces.append(np.concatenate(trace))
-    if traces[0].tobytes() != traces[1].tobytes():
-        step = int(np.flatnonzero((traces[0] != traces[1]).any(axis=1))[0])
+def refuse_randomness(one: ForeignEnvironment, other: ForeignEnvironment, max_episode_steps: int) -> None:
+    """Raise UnusableEnvironmentError if the same start and actions can lead elsewhere, in either of two environments.
+
+    Whole episodes are played, then again in the same environment after others, and in the other one. Raises it, too, if
+    nothing ends an episode but a limit so large that it is none.
+    """
+    rng, began, left = np.random.default_rng(0), time.monotonic(), _TRIAL_STEPS
+    episodes, has_end = [], False
+    for number, spread in enumerate(_TRIAL_SPREADS):
+        one.reset(seed=number + 1)
+        while not (one.terminated or one.truncated) and one.elapsed < min(max_episode_steps, left):
+            one.step(spread * rng.standard_normal(one.action_dim, dtype=np.float32))
+            if time.monotonic() - began > _TRIAL_S * (number + 1) / len(_TRIAL_SPREADS):
+                break
+        has_end = has_end or one.terminated or one.truncated
+        left -= one.elapsed
+        episodes.append((one.history(), one.elapsed))
+    for environment, again in ((one, episodes[::-1]), (other, episodes)):
+        for history, elapsed in again:
+            environment.replay(history, elapsed)
+    if not has_end and max_episode_steps > _LONGEST_WITHOUT_END:
         raise UnusableEnvironmentError(
-            f"environment {env_id!r} is not deterministic: after reset(seed=1), the same actions led to another "
-            f"state at step {step}; it must draw from self.np_random alone"
+            f"environment {one.env_id!r}: nothing ended an episode of {max(steps for _, steps in episodes)} steps, and "
+            f"its time limit is {max_episode_steps} steps, more than {_LONGEST_WITHOUT_END}; set a shorter one, as in "
+            "dynamics: {max_episode_steps: 1000}"
         )

@@ -163,7 +163,9 @@ def context(results: RunResults) -> Report:
         name=config.name,
         seed=config.seed,
         environment=config.environment.id,
-        dynamics=", ".join(f"{name} {value:g}" for name, value in dynamics.items()),
+        dynamics=", ".join(
+            f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}" for name, value in dynamics.items()
+        ),
         sources=sources,
         finding=summary.finding(found),
         cards=tuple(summary.cards(found)),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from oodil.pipeline.artifacts import Artifact, Files, encode_arrays, encode_json
 from oodil.pipeline.errors import DataError
-from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.policy import GaussianPolicy, action_units
 from oodil.pipeline.results.networks import Arrays, load_policy, policy_file
 
 _POLICY_META = "policy.json"
@@ -119,9 +119,10 @@ class LearningCurve:
 
 @dataclass(frozen=True)
 class Policy:
-    """A trained policy as it is used: it flattens observations and clips actions as its training did."""
+    """A trained policy as it is used: it flattens observations, and scales and clips actions, as its training did."""
 
     gaussian: GaussianPolicy
+    """Its actions are in units of the action space (`action_units`)."""
     environment_id: str
     observation_shape: tuple[int, ...]
     action_low: NDArray[np.float32]
@@ -141,7 +142,8 @@ class Policy:
             raise DataError(f"observation has shape {seen.shape}; the policy was trained on {self.observation_shape}")
         flat = seen.reshape(1 if single else len(seen), -1)
         actions = self.gaussian.mean(flat).reshape(-1, *self.action_low.shape)
-        clipped = np.clip(actions, self.action_low, self.action_high)
+        middle, half = action_units(self.action_low, self.action_high)
+        clipped = np.clip(middle + half * actions, self.action_low, self.action_high)
         return np.asarray(clipped[0] if single else clipped)
 
     def predict(

@@ -4,11 +4,13 @@ import hashlib
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import EnvironmentConfig, RunConfig, SourceConfig
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.datasets import read_demonstrations, read_file
-from oodil.pipeline.environments import Simulators, make_batch
+from oodil.pipeline.environments import Simulators, environment_spec, make_batch
 from oodil.pipeline.errors import DataError, ExpertError
 from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.policy import Controller, GaussianPolicy
@@ -59,12 +61,15 @@ class DemonstrationsStage(Stage):
         config = run.config
         section = config.demonstrations
         if section.file is not None:
+            _say_what_is_raw(config, context)
             demonstrations, _ = read_demonstrations(section.file)
             base = base_run(config)
             if base is not None:
                 demonstrations = Demonstrations.joined([load_demonstrations(base), demonstrations])
             return CollectedDemonstrations(demonstrations, (), config.environment.id).files()
         index = self.jobs(run).index(job)
+        if not index:
+            _say_what_is_raw(config, context)
         source = section.sources[index]
         try:
             demonstrations, kept = collect_demonstrations(
@@ -108,8 +113,10 @@ def transferable_marks(config: RunConfig) -> list[bool | None]:
 def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
     """Raise DataError or ExpertError, before any work, if the demonstrations cannot fit the environment."""
     section = config.demonstrations
+    count = sum(source.count for source in section.sources)
     if section.file is not None:
         demonstrations, environment = read_demonstrations(section.file)
+        count = len(demonstrations)
         if demonstrations.observation_dim != observation_dim:
             raise DataError(
                 f"{section.file}: states have {demonstrations.observation_dim} dimensions; "
@@ -117,6 +124,11 @@ def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
             )
         if environment and environment != config.environment.id:
             raise DataError(f"{section.file}: recorded in {environment}, but the run is for {config.environment.id}")
+    if count < config.clustering.num_clusters and config.finetuning.run is None:
+        raise DataError(
+            f"{section.file or 'demonstrations.sources'}: {count} demonstration{'s' * (count > 1)} cannot make "
+            f"{config.clustering.num_clusters} clusters; set clustering.num_clusters to {count} or less, or give more"
+        )
     for source in section.sources:
         if source.expert_folder is None:
             hand_written(make_batch(config.environment.id, source.dynamics, 1), config.environment.id)
@@ -127,6 +139,18 @@ def check_demonstrations(config: RunConfig, observation_dim: int) -> None:
                 f"{source.expert}: the expert sees {len(policy.input_mean)} dimensions; "
                 f"environment {config.environment.id} has {observation_dim}"
             )
+
+
+def _say_what_is_raw(config: RunConfig, context: JobContext) -> None:
+    """Warn of actions that have no bounds by which they could be scaled."""
+    environment = config.environment
+    low, high = environment_spec(environment.id, environment.dynamics).bounds()
+    raw = np.flatnonzero((low != -1) | (high != 1)).tolist()
+    if raw:
+        context.warn(
+            f"environment {environment.id!r} has no finite bounds for {'actions' if len(raw) > 1 else 'action'} "
+            f"{', '.join(map(str, raw))}: learned as they are, from a spread of 1, where others are scaled to [-1, 1]"
+        )
 
 
 def hand_written(simulators: Simulators, env_id: str) -> Controller:

@@ -93,7 +93,7 @@ class ExpertsStage(Stage):
         training = EXPERT_TRAINING.model_copy(update={"discount": source.expert_discount})
         policy = train_expert(environment, training, int(seed), context, self.checkpoints(run, job))
         described = {
-            "environment": environment.model_dump(),
+            "environment": environment.settings(),
             "training": training.model_dump(mode="json"),
             "seed": int(seed),
         }

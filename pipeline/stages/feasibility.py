@@ -45,7 +45,7 @@ class FeasibilityWeighting(Weighting):
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the section, how policies learn, the steps of all together, and the environment."""
-        section, environment = config.f_mdp.model_dump(), config.environment.model_dump()
+        section, environment = config.f_mdp.model_dump(), config.environment.settings()
         return {
             "f_mdp": section,
             "learning": _learning(config),

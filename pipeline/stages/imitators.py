@@ -85,7 +85,7 @@ class ImitatorsStage(Stage):
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return what a training depends on."""
         gail = config.transferability.gail.model_dump(mode="json")
-        return {"gail": gail, "environment": config.environment.model_dump()}
+        return {"gail": gail, "environment": config.environment.settings()}
 
     def jobs(self, run: Run) -> list[str]:
         """Return the jobs of each cluster that has demonstrations, named by the cluster's id."""

@@ -65,7 +65,7 @@ class InverseDynamics(Weighting):
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the imitator's environment, and how it is explored and learned from."""
-        return config.inverse_dynamics.model_dump() | {"environment": config.environment.model_dump()}
+        return config.inverse_dynamics.model_dump() | {"environment": config.environment.settings()}
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Explore, learn the model, follow what was held out and every demonstration, and turn errors into scores."""
@@ -126,7 +126,7 @@ class InverseDynamics(Weighting):
         key = derive_key(config.seed, "inverse_dynamics", "exploration")
         num_steps = how.num_iterations * how.steps_per_rollout
         batch = experience(policy, config.environment, how, num_steps, torch_seed(key), context)
-        return Exploration.of(batch, _bounds(spec), config.inverse_dynamics.held_out, key)
+        return Exploration.of(batch, spec.bounds(), config.inverse_dynamics.held_out, key)
 
 
 class _Pace:
@@ -242,13 +242,8 @@ def _untrained(config: RunConfig, spec: EnvironmentSpec) -> GaussianPolicy:
 def _follower(config: RunConfig, model: "InverseModel") -> ModelFollower:
     """Return simulators of the imitator's environment, whose actions a model chooses."""
     environment = config.environment
-    bounds = _bounds(environment_spec(environment.id, environment.dynamics))
+    bounds = environment_spec(environment.id, environment.dynamics).bounds()
     return ModelFollower(make_batch(environment.id, environment.dynamics, SIMULATORS), bounds, model)
-
-
-def _bounds(spec: EnvironmentSpec) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the (A,) lowest and highest action."""
-    return spec.action_low.ravel(), spec.action_high.ravel()
 
 
 register(InverseDynamics("inverse_dynamics_random", title="ID without GAIL", explorer=None))

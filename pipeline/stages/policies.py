@@ -54,7 +54,7 @@ class PolicyStage(Stage):
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return what a training depends on."""
         gail = self.gail(config).model_dump(mode="json")
-        return {"gail": gail, "environment": config.environment.model_dump()}
+        return {"gail": gail, "environment": config.environment.settings()}
 
     def gail(self, config: RunConfig) -> GailConfig:
         """Return how each training is done."""

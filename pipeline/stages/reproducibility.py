@@ -41,7 +41,7 @@ class ReproducibilityStage(Stage):
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the imitator's environment and what the trials depend on."""
-        return section_of(config).model_dump() | {"environment": config.environment.model_dump()}
+        return section_of(config).model_dump() | {"environment": config.environment.settings()}
 
     def jobs(self, run: Run) -> list[str]:
         """Return one job for every few demonstrations, named by the first and the last."""

@@ -180,7 +180,7 @@ def read_later(
 def evaluate(
     policy: Policy,
     environment: str,
-    dynamics: Mapping[str, float] | None = None,
+    dynamics: Mapping[str, Any] | None = None,
     *,
     episodes: int = 32,
     seed: int = 0,

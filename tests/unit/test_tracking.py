@@ -37,14 +37,15 @@ def recorded(env_id: str, actions: np.ndarray, seed: int = 0) -> Demonstrations:
     return Demonstrations.of([Episode(np.array(states))], "recorded")
 
 
-class Idle:
-    """Whoever does nothing."""
+UNPUSHED = 0.6
+"""The action that does not push a cart: 0 in units of its pushes, which lie in [-2, 0.5]."""
 
-    def __init__(self, action_dim: int) -> None:
-        self._action_dim = action_dim
+
+class Idle:
+    """Whoever does not push."""
 
     def mean(self, observations: np.ndarray) -> np.ndarray:
-        return np.zeros((len(observations), self._action_dim), np.float32)
+        return np.full((len(observations), 1), UNPUSHED, np.float32)
 
 
 def test_the_return_is_minus_the_discounted_distance() -> None:
@@ -55,9 +56,9 @@ def test_the_return_is_minus_the_discounted_distance() -> None:
     slower, behind = STEP * np.array([1, 2, 3]), STEP**2 * np.array([0, 1, 3])
     missed = np.hypot(2 * behind, slower)
     expected = missed[0] + 0.5 * missed[1] + 0.25 * missed[2]
-    np.testing.assert_allclose(distances(simulators, Idle(1)), [expected, 0.0], atol=1e-6)
+    np.testing.assert_allclose(distances(simulators, Idle()), [expected, 0.0], atol=1e-6)
     simulators.track(0, 0)
-    rewards = [simulators.step(np.zeros((3, 1))).env_rewards[0] for _ in range(5)]
+    rewards = [simulators.step(np.full((3, 1), UNPUSHED)).env_rewards[0] for _ in range(5)]
     np.testing.assert_allclose(rewards, [-missed[0], -0.5 * missed[1], -0.25 * missed[2], 0, 0], atol=1e-6)
 
 
@@ -135,7 +136,7 @@ def test_a_snapshot_continues_to_the_same_bits(
 
 def test_distances_do_not_depend_on_who_is_tracked_beside() -> None:
     demonstrations = driven(0.0, 0.5, 1.0, -1.0, -2.0)
-    found = [distances(tracking(demonstrations, CART, count), Idle(1)) for count in (1, 2, 8)]
+    found = [distances(tracking(demonstrations, CART, count), Idle()) for count in (1, 2, 8)]
     np.testing.assert_array_equal(found[0], found[1])
     np.testing.assert_array_equal(found[0], found[2])
     assert found[0].argmin() == 0
