@@ -19,9 +19,11 @@ STATES = 1000
 
 @pytest.fixture
 def policy(network: Callable[..., PolicyNetwork]) -> Policy:
-    """A policy for observations of (2, 3) and actions of (4,), one without bounds and one with a single one."""
-    gaussian = replace(network(observation_dim=6, action_dim=4, hidden=(16, 12)).export(), input_limit=LARGEST_INPUT)
-    low, high = np.float32([-0.2, -np.inf, 0.0, -np.inf]), np.float32([0.1, np.inf, 0.3, 0.05])
+    """A policy for observations of (2, 3) and actions of (4,): small, without bounds, in newtons, with one bound."""
+    gaussian = network(observation_dim=6, action_dim=4, hidden=(16, 12)).export()
+    weights = (*gaussian.weights[:-1], gaussian.weights[-1] * 5)  # so that some actions reach their bounds
+    gaussian = replace(gaussian, weights=weights, input_limit=LARGEST_INPUT)
+    low, high = np.float32([-0.2, -np.inf, -2000, -np.inf]), np.float32([0.1, np.inf, 3000, 0.05])
     return Policy(gaussian, "Some-v0", (2, 3), low, high, env_steps=7)
 
 
@@ -43,7 +45,8 @@ def test_a_thousand_states_give_the_actions_of_the_policy(policy: Policy, tmp_pa
     expected = policy.act(seen)
     (action,) = session(policy, tmp_path / "policy.onnx").run(None, {"observation": seen})
     assert (action.shape, action.dtype) == ((STATES, 4), np.float32)
-    np.testing.assert_allclose(action, expected, rtol=0, atol=2e-6)
+    in_units = np.float32([0.15, 1, 2500, 1])  # half of what lies between two bounds
+    np.testing.assert_allclose(action / in_units, expected / in_units, rtol=0, atol=5e-6)
     standardized = (seen.reshape(STATES, -1) - policy.gaussian.input_mean) * policy.gaussian.input_scale
     assert (np.abs(standardized) > LARGEST_INPUT).any() and (np.abs(standardized) < LARGEST_INPUT).all(axis=1).any()
     assert all((expected[:, a] == bound[a]).any() for a, bound in [(0, policy.action_high), (2, policy.action_low)])
