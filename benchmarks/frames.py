@@ -5,6 +5,7 @@ Needs a machine that can render; without a display, MUJOCO_GL=osmesa or egl.
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -24,9 +25,9 @@ def main() -> None:
     arguments = parser.parse_args()
     run = oodil.open_run(arguments.run_dir)
     environment, policy = run.config.environment, run.policy(arguments.policy)
-    env = gymnasium.make(
-        environment.id, render_mode="rgb_array", camera_name="track", width=SIZE, height=SIZE, **environment.dynamics
-    )
+    looks = {"render_mode": "rgb_array", "camera_name": "track", "width": SIZE, "height": SIZE}
+    made_with: dict[str, Any] = environment.dynamics | looks
+    env = gymnasium.make(environment.id, **made_with)
     observation, _ = env.reset(seed=0)
     frames: list[np.ndarray] = []
     while len(frames) < FRAMES:

@@ -14,7 +14,7 @@ FORCE, TIME_STEP, START = 2000.0, 0.05, 4.0
 """N, s, m."""
 
 
-class CartEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+class CartEnv(gymnasium.Env[Any, np.ndarray]):
     """A cart to be brought to rest in the middle. Its mass, in kg, is what differs between robots."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 - as Gymnasium declares it

@@ -26,7 +26,7 @@ def recordings(mass: float, count: int, seed: int = 0) -> list[np.ndarray]:
         states = [state]
         for _ in range(100):
             force = np.clip(-1500 * state[0] - 2000 * state[1], -cart.FORCE, cart.FORCE)
-            state, *_ = env.step(np.float32([force]))
+            state = env.step(np.array([force], np.float32))[0]
             states.append(state)
         found.append(np.array(states))
     return found

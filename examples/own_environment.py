@@ -30,6 +30,6 @@ for source in run.verdicts().by_source:
 # An episode of ours; actions are newtons.
 policy, env = run.policy(), cart.make(mass=900.0)
 observation, _ = env.reset(seed=0)
-for _ in range(100):
-    observation, *_ = env.step(policy.act(observation))
+for _step in range(100):
+    observation = env.step(policy.act(observation))[0]
 print(f"after 5 s the cart is at {observation[0]:.2f} m")
