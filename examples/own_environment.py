@@ -16,8 +16,8 @@ config = {
     "environment": {"id": "cart:Cart-v0", "dynamics": {"mass": 900.0}},
     "demonstrations": {"file": data},
     "clustering": {"num_clusters": 2},
-    "transferability": {"gail": {"total_steps": 100_000}},
-    "imitation": {"gail": {"total_steps": 100_000}},
+    "transferability": {"gail": {"total_steps": 60_000}},
+    "imitation": {"num_trainings": 1, "gail": {"total_steps": 60_000}},
 }
 
 # In this process alone: others would have to find cart.py, too, on PYTHONPATH.

@@ -59,12 +59,12 @@ def carts(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run of the example with an environment and recordings of one's own, as small as it goes."""
     folder = tmp_path_factory.mktemp("carts")
     said = script("own_data.py", folder / "carts.safetensors")
-    assert said == [f"{folder / 'carts.safetensors'}: 40 demonstrations of light cart, heavy cart"]
+    assert said == [f"{folder / 'carts.safetensors'}: 40 demonstrations of heavy cart, light cart"]
     sections = ("clustering", "transferability", "imitation", "evaluation", "runtime")
     small = yaml.safe_load(MICRO.read_text())
     overrides = [f"{name}={yaml.safe_dump(small[name], default_flow_style=True, width=9999)}" for name in sections]
     said = script("own_environment.py", folder / "carts.safetensors", folder / "run", *overrides)
-    assert [line.partition(":")[0] for line in said[:2]] == ["light cart", "heavy cart"]
+    assert [line.partition(":")[0] for line in said[:2]] == ["heavy cart", "light cart"]
     assert re.fullmatch(r"after 5 s the cart is at -?\d+\.\d\d m", said[2])
     return folder
 
