@@ -1,27 +1,35 @@
-# make install | quickstart | unit | test | docs: each prepares what it needs and can be repeated.
+# make quickstart | install | unit | test | docs: each prepares what it needs and can be repeated.
 PYTHON ?= python3
 PIP_ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
+PIP = $(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint constraints.txt
+# Nothing here uses a GPU, and elsewhere PyTorch's ordinary build is without one.
+CPU_BUILD := $(if $(filter Linux,$(shell uname)),--index-url https://download.pytorch.org/whl/cpu)
 
 .PHONY: install quickstart smoke unit test check docs clean
-install: $(VENV)/installed
+install: $(VENV)/developed
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	@echo "installing PyTorch ..."
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint constraints.txt torch
+	@$(PIP) $(CPU_BUILD) --retries 0 --no-deps torch 2>/dev/null || $(PIP) torch
 	@echo "installing oodil and what it needs ..."
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint constraints.txt --editable ".[test]"
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint constraints.txt --no-deps robosuite  # docs/decisions.md
+	$(PIP) --editable .
 	@touch $@
 	@echo "installed; try: $(BIN)/oodil --help"
 
-quickstart: install
+$(VENV)/developed: $(VENV)/installed
+	@echo "installing what the tests need ..."
+	$(PIP) --editable ".[test]"
+	$(PIP) --no-deps robosuite  # docs/decisions.md
+	@touch $@
+
+quickstart: $(VENV)/installed
 	$(BIN)/oodil run configs/quickstart.yaml
 
-smoke: install
+smoke: $(VENV)/installed
 	$(BIN)/oodil run configs/smoke.yaml
 
 check: install
@@ -40,7 +48,7 @@ docs: $(VENV)/docs
 	@echo "build/docs/index.html"
 
 $(VENV)/docs: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint constraints.txt --editable ".[docs]"
+	$(PIP) --editable ".[docs]"
 	@touch $@
 
 clean:

@@ -24,6 +24,7 @@ from oodil.pipeline.environments import check_environment
 from oodil.pipeline.errors import ConfigError, DamagedArtifactError, StorageError, UnfinishedError
 from oodil.pipeline.loading import parse_config
 from oodil.pipeline.locks import held
+from oodil.pipeline.metrics import check_logger
 from oodil.pipeline.stage import Run, Stage, state_of
 from oodil.pipeline.stages import stages
 from oodil.pipeline.stages.demonstrations import check_demonstrations
@@ -114,7 +115,8 @@ def refuse_to_replace(run: Run, force: Collection[str]) -> None:
 
 
 def check_inputs(config: RunConfig, run: Run | None = None) -> None:
-    """Refuse, before any work, an environment that cannot be made and demonstrations that cannot fit it.
+    """Refuse, before any work, an environment that cannot be made and demonstrations that cannot fit it, and a
+    logger that is not there.
 
     A ``run`` that has taken over its demonstrations is not asked for what they are from.
     """
@@ -124,6 +126,7 @@ def check_inputs(config: RunConfig, run: Run | None = None) -> None:
     check_demonstrations(config, spec.observation_dim, run)
     if TargetDemonstrationsStage.name in [stage.name for stage in stages(config)]:
         check_target(config, spec.observation_dim)
+    check_logger(config.runtime.logger)
 
 
 def choose(config: RunConfig, until: str | None = None, force: Collection[str] = ()) -> list[Stage]:

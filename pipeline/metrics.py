@@ -1,4 +1,5 @@
-"""What a job reports while it runs: one JSON object per line, and TensorBoard's event files where that is installed.
+"""What a job reports while it runs: one JSON object per line, TensorBoard's event files where that is installed, and
+a logger with wandb's interface where one is asked for.
 
 Every line has ``step`` and ``total`` (environment steps or iterations, as the job counts), ``rate`` (steps per second
 since the line before; null for the first) and the figures of the job. A file has at most `MAX_LINES` lines: when it is
@@ -7,7 +8,11 @@ full every second one is dropped, and from then on only half as many are written
 
 import json
 import math
+import os
 import time
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any, Protocol
 
@@ -15,8 +20,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodil.pipeline.artifacts import write_file
+from oodil.pipeline.errors import ConfigError
 
 MAX_LINES = 2000
+
+
+@dataclass(frozen=True)
+class Logger:
+    """A module with wandb's interface, and under which names it files what a job reports. It is loaded by `Metrics`."""
+
+    module: str
+    """``wandb`` or ``trackio``."""
+    project: str
+    group: str
+    name: str
+    folder: Path
+    """Of the run; wandb writes below it."""
+
+
+def check_logger(module: str | None) -> None:
+    """Raise ConfigError if a logger is asked for that is not installed."""
+    if module is not None and find_spec(module) is None:
+        raise ConfigError(f"runtime.logger: {module} is not installed; pip install {module}")
 
 
 class Metrics:
@@ -26,11 +51,12 @@ class Metrics:
     the disk does not take it. Use it as a context manager or call `close`.
     """
 
-    def __init__(self, path: Path, tensorboard: Path | None = None) -> None:
+    def __init__(self, path: Path, tensorboard: Path | None = None, logger: Logger | None = None) -> None:
         self._path = path
         self._tensorboard = tensorboard
+        self._logger = logger
         self._file: IO[bytes] | None = None
-        self._events: _EventWriter | None = None
+        self._others: list[_Writer] = []
         self._lines: list[tuple[int, bytes]] = []
         """Step and text of each line in the file."""
         self._interval = 1
@@ -64,16 +90,16 @@ class Metrics:
         self._file.flush()
         if len(self._lines) >= MAX_LINES:
             self._thin_out()
-        if self._events is not None:
-            self._events.write(step, {"rate": rate} | figures)
+        for other in self._others:
+            other.write(step, {"rate": rate} | figures)
 
     def close(self) -> None:
         """Close the files; harmless when repeated."""
         if self._file is not None:
             self._file.close()
-        if self._events is not None:
-            self._events.close()
-        self._file = self._events = None
+            self._file = None
+        while self._others:
+            self._others.pop().close()
 
     def _open(self, step: int) -> None:
         """Open the files for a job whose first report is of ``step``; what is there of later steps is dropped."""
@@ -82,7 +108,9 @@ class Metrics:
         self._lines = [(at, line) for at, line in self._lines if at < step]
         self._rewrite()
         if self._tensorboard is not None:
-            self._events = _event_writer(self._tensorboard, step)
+            self._others += _event_writers(self._tensorboard, step)
+        if self._logger is not None:
+            self._others.append(_LoggerWriter(self._logger))
 
     def _thin_out(self) -> None:
         # From the end, so that the newest line stays.
@@ -129,21 +157,47 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-class _EventWriter(Protocol):
+class _Writer(Protocol):
     def write(self, step: int, figures: dict[str, float]) -> None: ...
 
     def close(self) -> None: ...
 
 
-def _event_writer(folder: Path, first_step: int) -> "_EventWriter | None":
-    """Return a writer of TensorBoard's event files, or None where tensorboard is not installed."""
+class _LoggerWriter:
+    """One run of a logger; an attempt that goes on after another has a run of its own."""
+
+    def __init__(self, logger: Logger) -> None:
+        # Nothing goes over the network unless its user says so, by WANDB_MODE or trackio's variables; one run of ours
+        # ends none that the caller of `oodil.run` has open, and no terminal output is taken or added.
+        options: dict[str, dict[str, Any]] = {
+            "wandb": {
+                "mode": os.environ.get("WANDB_MODE", "offline"),
+                "dir": str(logger.folder),
+                "reinit": "create_new",
+                "settings": {"silent": True, "console": "off"},
+            },
+            "trackio": {"embed": False},
+        }
+        self._run = import_module(logger.module).init(
+            project=logger.project, group=logger.group, name=logger.name, **options[logger.module]
+        )
+
+    def write(self, step: int, figures: dict[str, float]) -> None:
+        self._run.log(figures, step=step)
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+def _event_writers(folder: Path, first_step: int) -> list[_Writer]:
+    """Return a writer of TensorBoard's event files, or none where tensorboard is not installed."""
     try:
         # tensorboard's own writer; the one of torch.utils loads far more.
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from tensorboard.compat.proto.summary_pb2 import Summary
         from tensorboard.summary.writer.event_file_writer import EventFileWriter
     except ImportError:
-        return None
+        return []
 
     class Writer:
         def __init__(self) -> None:
@@ -161,4 +215,4 @@ def _event_writer(folder: Path, first_step: int) -> "_EventWriter | None":
         def _add(self, step: int, **content: Any) -> None:
             self._writer.add_event(Event(wall_time=time.time(), step=step, **content))
 
-    return Writer()
+    return [Writer()]

@@ -9,7 +9,7 @@ from oodil.pipeline.artifacts import RunDirectory, write_artifact
 from oodil.pipeline.collecting import InlineRollouts, RolloutSource
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.loading import find_modules
-from oodil.pipeline.metrics import Metrics
+from oodil.pipeline.metrics import Logger, Metrics
 from oodil.pipeline.stage import JobStoppedError, Run, Stage, stage_named
 from oodil.pipeline.versions import library_versions
 from oodil.workers.channels import Access
@@ -74,7 +74,9 @@ def run_job(
     try:
         with (
             one_thread(),
-            Metrics(directory.metrics(stage.name, job), directory.tensorboard(stage.name, job)) as metrics,
+            Metrics(
+                directory.metrics(stage.name, job), directory.tensorboard(stage.name, job), _logger(run, stage, job)
+            ) as metrics,
         ):
             interval_s = run.config.runtime.checkpoint_interval_s
             files = stage.run_job(run, job, Context(rollouts, interval_s, send, should_stop, metrics))
@@ -83,6 +85,15 @@ def run_job(
     write_artifact(directory.job(stage.name, job), stage.job_origin(run, job), files, library_versions())
     stage.checkpoints(run, job).clear()
     return DONE
+
+
+def _logger(run: Run, stage: Stage, job: str) -> Logger | None:
+    """Return where a job's figures are shown besides; a run is a group of a project, and an attempt one of its runs."""
+    config = run.config
+    if config.runtime.logger is None:
+        return None
+    group, name = f"{config.name}-seed{config.seed}", f"{stage.name}/{job}"
+    return Logger(config.runtime.logger, "oodil", group, name, run.directory.path)
 
 
 def open_stage(run_path: str, name: str, module: str) -> tuple[Stage, Run]:

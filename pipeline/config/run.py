@@ -52,6 +52,9 @@ class RuntimeConfig(Section):
     modules: Path | None = None
     """Folder of the modules that `environment.id` and `baselines` name, where they are not installed; that of the
     configuration file unless something else is said, and relative to it."""
+    logger: Literal["wandb", "trackio"] | None = None
+    """Also shows what jobs report there, on this machine alone unless WANDB_MODE or trackio's own variables say
+    otherwise; each job logs from its own process (docs/operations.md)."""
 
 
 _PAPER_GAIL: dict[str, Any] = {

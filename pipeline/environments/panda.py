@@ -396,5 +396,8 @@ def _assembled() -> str:
         box = BoxObject("box", size=[side / 2 for side in BOX_SIZE], density=density, rgba=(0.85, 0.45, 0.2, 1))
         xml: str = ManipulationTask(mujoco_arena=arena, mujoco_robots=[robot], mujoco_objects=[box]).get_xml()
         return xml
+    except ModuleNotFoundError as error:
+        both = "pip install 'oodil[robot]' && pip install --no-deps robosuite"  # docs/decisions.md
+        raise ModuleNotFoundError(f"needs {error.name}; {both}", name=error.name) from error
     finally:
         logging.disable(logging.NOTSET)

@@ -1,15 +1,39 @@
 """Metrics files: what is in them, how long they get, and what a resumed or killed job makes of them."""
 
 import json
+import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import oodil
 from oodil.pipeline import metrics
-from oodil.pipeline.metrics import Metrics, read_metrics
+from oodil.pipeline.metrics import Logger, Metrics, read_metrics
+from tests.runs import MICRO
+
+LOGGER = """
+import json, os, sys
+
+class Run:
+    def __init__(self, options):
+        self.say("init", options)
+    def say(self, what, values):
+        with open(os.environ["LOGGED"], "a") as file:
+            print(json.dumps([os.getpid(), what, values]), file=file)
+    def log(self, figures, step):
+        self.say("log", {"step": step} | figures)
+    def finish(self):
+        self.say("finish", {})
+
+def init(**options):
+    return Run(options)
+"""
+"""A module of wandb's interface that keeps what it is told. The real ones bring thirty packages each."""
 
 
 @pytest.fixture
@@ -98,3 +122,62 @@ def test_without_tensorboard_the_file_is_there_all_the_same(
         written.write(1, 2, {})
     assert read_metrics(path)["step"].tolist() == [1]
     assert not (tmp_path / "events").exists()
+
+
+@pytest.fixture
+def logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Put loggers on the path, for child processes, too; return the file of what they are told."""
+    folder = tmp_path / "loggers"
+    folder.mkdir()
+    for name in ("wandb", "trackio"):
+        (folder / f"{name}.py").write_text(LOGGER)
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
+    monkeypatch.setenv("LOGGED", str(tmp_path / "logged"))
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    yield tmp_path / "logged"
+    for name in ("wandb", "trackio"):
+        sys.modules.pop(name, None)
+
+
+def told(path: Path) -> list[tuple[int, str, dict[str, Any]]]:
+    return [tuple(json.loads(line)) for line in path.read_text().splitlines()]
+
+
+@pytest.mark.parametrize("module", ["wandb", "trackio"])
+def test_a_logger_is_told_the_same_and_stays_off_the_network(
+    path: Path, tmp_path: Path, logged: Path, module: str
+) -> None:
+    with Metrics(path, logger=Logger(module, "oodil", "micro-seed0", "imitation/imitation", tmp_path)) as written:
+        assert module not in sys.modules
+        for step in (10, 20):
+            written.write(step, 20, {"loss": step / 4})
+    (_, begun, options), *lines, (_, ended, _) = told(logged)
+    assert (begun, ended) == ("init", "finish")
+    assert [options.pop(name) for name in ("project", "group", "name")] == [
+        "oodil",
+        "micro-seed0",
+        "imitation/imitation",
+    ]
+    assert options["mode"] == "offline" if module == "wandb" else options == {"embed": False}
+    assert [(line["step"], line["loss"]) for _, _, line in lines] == [(10, 2.5), (20, 5.0)]
+
+
+@pytest.mark.slow
+def test_a_job_logs_from_its_own_process_and_to_the_same_bits(
+    tmp_path: Path, logged: Path, undisturbed: dict[str, str]
+) -> None:
+    run = oodil.run(MICRO, ["runtime.logger=trackio"], workers=1, until="clustering", run_dir=tmp_path / "run")
+    stages = run.describe()["stages"]
+    assert all(stages[name]["sha256"] == undisturbed[name] for name in ("demonstrations", "clustering"))
+    begun = [(process, options["name"]) for process, what, options in told(logged) if what == "init"]
+    assert "clustering/clustering" in {name for _, name in begun}
+    assert os.getpid() not in {process for process, _ in begun}
+
+
+def test_a_logger_that_is_not_there_is_refused_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "find_spec", lambda module: None)
+    with pytest.raises(oodil.OodilError, match=r"runtime\.logger: wandb is not installed; pip install wandb"):
+        oodil.run(MICRO, ["runtime.logger=wandb"], run_dir=tmp_path / "run")
+    assert not (tmp_path / "run").exists()

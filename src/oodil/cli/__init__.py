@@ -65,6 +65,7 @@ for _command in (
     runs.status,
     runs.report,
     policies.evaluate,
+    policies.export_policy,
     policies.score,
     policies.finetune,
     experiments.table,

@@ -15,6 +15,7 @@ from oodil.cli.options import (
     execute_and_report,
     state_keys,
 )
+from oodil.pipeline.errors import ConfigError
 
 
 def evaluate(
@@ -49,6 +50,29 @@ def evaluate(
             f"{name}: return {seen.mean_return:.1f} ± {seen.std_return:.1f}, "
             f"length {seen.mean_length:.0f}, {episodes} deterministic episodes, seed {seed}{told}"
         )
+
+
+def export_policy(
+    run_dir: RunPath,
+    onnx: Annotated[Path, typer.Option(metavar="FILE.onnx", help="Where the model goes.")],
+    policy: Annotated[str | None, typer.Option(metavar="NAME", help="Of the run's policies; default: ours.")] = None,
+) -> None:
+    """Write a trained policy as an ONNX model, from raw observations to the actions to apply."""
+    from oodil.api import open_run
+
+    results = open_run(run_dir)
+    known = [each.name for each in results.policies]
+    name = policy or known[0]
+    if name not in known:
+        raise ConfigError(f"{run_dir}: no policy {name!r}; this run has {', '.join(known)}")
+    trained = results.policy(name)
+    try:
+        from oodil.pipeline.onnx_export import write_onnx
+    except ImportError as error:
+        raise ConfigError(f"--onnx needs {error.name}; pip install 'oodil[onnx]'") from None
+    write_onnx(trained, name, onnx)
+    seen, action = (list(shape) for shape in (trained.observation_shape, trained.action_low.shape))
+    print(f"{onnx}: {name}, observation {['batch', *seen]} to action {['batch', *action]}, float32")
 
 
 def score(
