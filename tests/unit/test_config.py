@@ -196,8 +196,8 @@ def test_a_value_of_any_type_is_taken_or_refused(key):
         ({"demonstrations": {"file": "a", "sources": [SOURCE]}}, "demonstrations: give either file or sources"),
         ({"demonstrations": {"sources": [SOURCE, SOURCE]}}, "two sources have the same label"),
         (
-            {"demonstrations": {"sources": [SOURCE], "marks": {"a": True}}},
-            "demonstrations: marks are of the sources in a",
+            {"demonstrations": {"sources": [SOURCE], "transferable": ["a"]}},
+            "labels, transferable and unmarked are for a file",
         ),
         ({"baselines": ["oracle_target"]}, "learns from an expert of the imitator's own dynamics; name one"),
         ({"baselines": ["oracle"]}, "the oracle needs sources that are marked transferable"),

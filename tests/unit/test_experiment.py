@@ -94,8 +94,8 @@ def test_only_what_the_methods_need_is_computed(experiment, tmp_path):
     everything = {each.name: each for each in outlook(table, table.select(None, None))}
     # The longest first: 2 clusters x 12,000 steps and two policies.
     assert next(iter(everything)) == "1-2-seed3"
-    assert everything["1-2-seed3"].env_steps == 24_000 + 2 * 24_000
-    assert everything["1-2-kept-seed3"].env_steps == 24_000
+    assert everything["1-2-seed3"].cost.env_steps == 24_000 + 2 * 24_000
+    assert everything["1-2-kept-seed3"].cost.env_steps == 24_000
     assert everything["1-2-kept-seed3"].own == ["imitation"]
     assert everything["1-2-plain-seed3"].shared == ["demonstrations"]
     assert not list(tmp_path.glob("micro*"))
