@@ -41,7 +41,7 @@ def test_kill_all_then_resume(
     live.kill_group()
     nothing_left(live)
     output = run("resume", str(tmp_path / "run"), "--workers", str(workers_after))
-    begun = next(line for line in output.splitlines() if line.startswith(f"▶ {stage}"))
+    begun = next(line for line in output.splitlines() if f"▶ {stage}" in line)
     assert "resumed from checkpoint" in begun
     assert artifacts(tmp_path / "run") == without_baselines(undisturbed)
 
