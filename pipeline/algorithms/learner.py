@@ -161,15 +161,16 @@ class Learner(Generic[Reward]):
 
     @torch.no_grad()
     def _shrink_noise(self, iteration: int) -> None:
-        """Lower the ceiling of the policy's deviation, from its first value to its last, in the second half.
+        """Lower the bounds between which the policy's deviation lies in the second half, until both are its last value.
 
-        The last value is its floor throughout: a policy that has lost its noise early explores no more.
+        There is a floor from the beginning: a policy that has lost its noise early explores no more.
         """
         config = self.config
         if config.final_std is not None:
             done = max(0.0, 2 * (iteration + 1) / config.num_iterations - 1)
-            floor = float(np.log(config.final_std))
-            self.policy.log_std.clamp_(floor, (1 - done) * config.initial_log_std + done * floor)
+            last, highest = float(np.log(config.final_std)), config.initial_log_std
+            lowest = min(float(np.log(config.least_std)), highest)
+            self.policy.log_std.clamp_((1 - done) * lowest + done * last, (1 - done) * highest + done * last)
 
     @torch.no_grad()
     def _values(self, inputs: Tensor, batch: TransitionBatch) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -103,8 +103,10 @@ class TrainingConfig(Section):
     initial_log_std: float = 0.0
     """Logarithm of the policy's initial standard deviation."""
     final_std: PositiveFloat | None = None
-    """What the policy's standard deviation shrinks to in the second half of the training, and never falls below, so
-    that mean actions do what sampled ones learned; null leaves it alone."""
+    """What the policy's standard deviation shrinks to in the second half of the training, so that mean actions do what
+    sampled ones learned; null leaves it alone."""
+    least_std: PositiveFloat = 0.4
+    """What that deviation does not fall below before it shrinks, with a `final_std`: or exploration would end early."""
     policy_optimizer: Annotated[TrpoConfig | PpoConfig, Field(discriminator="kind")] = TrpoConfig()
     """How the policy is improved."""
     value: ValueConfig = ValueConfig()
@@ -135,7 +137,7 @@ class GailConfig(TrainingConfig):
     """Adversarial imitation: training whose reward comes from a discriminator."""
 
     final_std: PositiveFloat | None = 0.1
-    """What the policy's standard deviation shrinks to in the second half of the training, and never falls below, so
-    that mean actions do what sampled ones learned; null leaves it alone."""
+    """What the policy's standard deviation shrinks to in the second half of the training, so that mean actions do what
+    sampled ones learned; null leaves it alone."""
     discriminator: DiscriminatorConfig = DiscriminatorConfig()
     """What tells demonstrations from the policy."""

@@ -309,7 +309,7 @@ class TestEnds:
         np.testing.assert_allclose(seen[0], expected, rtol=1e-6)
 
 
-def test_noise_shrinks_in_the_second_half_and_never_falls_below_its_last_value(demonstrations, rollout):
+def test_noise_keeps_its_floor_and_shrinks_in_the_second_half(demonstrations, rollout):
     config = GailConfig(total_steps=6 * 10, num_groups=1, simulators_per_group=2, steps_per_rollout=3, final_std=0.2)
     assert config.num_iterations == 10
     learner = Learner(3, 2, config, AdversarialReward(demonstrations(9), np.ones(1), DiscriminatorConfig(), 9, 0), 0)
@@ -319,8 +319,10 @@ def test_noise_shrinks_in_the_second_half_and_never_falls_below_its_last_value(d
     for iteration in range(10):
         learner.update(TransitionBatch.of([rollout(iteration)]), iteration)
         ceilings.append(learner.policy.log_std.detach().exp().tolist())
-    assert all(low >= 0.2 - 1e-6 for _, low in ceilings)
+    assert ceilings[0][1] == pytest.approx(0.4)
+    assert all(low >= 0.4 - 1e-6 for _, low in ceilings[:5])
     assert ceilings[4][0] > 0.8
     for i, factor in enumerate((0.8, 0.6, 0.4, 0.2, 0.0), start=5):
         assert ceilings[i][0] <= 0.2 ** (1 - factor) + 1e-6
-    assert ceilings[-1][0] == pytest.approx(0.2)
+        assert ceilings[i][1] >= 0.4**factor * 0.2 ** (1 - factor) - 1e-6
+    assert ceilings[-1] == pytest.approx([0.2, 0.2])
