@@ -3,7 +3,8 @@
 A fresh virtual environment from the wheel; an environment class in a file beside the YAML, with actions in newtons and
 observations in a dictionary; recordings of two labs in robomimic's format, states under nested keys; the run, its
 verdict, a film, an ONNX model and its first action without oodil. Run ``python benchmarks/first_hour.py --json FILE``
-in the environment of ``make install``; pip is called with ``constraints.txt``, which pins the build of PyTorch.
+in the environment of ``make install``: the newcomer gets the versions of ``constraints.txt`` and that environment's
+build of PyTorch, which pip has to find (``PIP_EXTRA_INDEX_URL`` or ``PIP_FIND_LINKS``).
 """
 
 import os
@@ -12,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from importlib.metadata import distributions
+from importlib.metadata import distributions, version
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +91,8 @@ def walk(folder: Path, steps: int) -> dict[str, Any]:
     pip = ("python", "-m", "pip", "install", "--quiet", "--constraint", str(ROOT / "constraints.txt"))
     went = Walk(folder)
     went.step("venv", "python", "-m", "venv", "venv")
-    went.step("install", *pip, str(built))
+    # Of two builds of a version, pip would take one with CUDA where it knows no other index than PyPI.
+    went.step("install", *pip, f"torch=={version('torch')}", str(built))
     core = went.installation()
     went.step("extras", *pip, f"{built}[data,onnx]", "onnxruntime")
     # `python -c` finds cart.py in the present folder; a conversion has no configuration that it could lie beside.
