@@ -22,6 +22,7 @@ from common import arguments_of, circumstances, save
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
+NOT_BUILT = (".*", "build", "runs", "tables", "tests", "docs", "benchmarks", "__pycache__", "*.egg-info")
 KEYS = "robot/base/place,robot/base/speed"
 CONFIG = """\
 name: cart
@@ -82,7 +83,9 @@ class Walk:
 
 def walk(folder: Path, steps: int) -> dict[str, Any]:
     """Go the whole way in an empty folder and return the figures."""
-    wheel = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT)]
+    # Of a copy: setuptools leaves a folder behind where it builds, and takes what is in it the next time.
+    source = shutil.copytree(ROOT, folder / "source", symlinks=True, ignore=shutil.ignore_patterns(*NOT_BUILT))
+    wheel = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(source)]
     subprocess.run(wheel, check=True)
     (built,) = folder.glob("*.whl")
     shutil.copy(EXAMPLES / "cart.py", folder)
