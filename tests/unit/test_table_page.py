@@ -278,6 +278,23 @@ def test_the_results_in_the_docs_are_those_that_are_committed():
     assert (ROOT / "docs" / "results.md").read_text(encoding="utf-8") == script["page"]()
     drawn = {path.name for path in (ROOT / "docs" / "results").glob("*")}
     assert drawn == set(re.findall(r"\(results/([^)]+)\)", script["page"]()))
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert readme == script["readme"](readme)
+
+
+def test_the_readme_has_the_rows_with_the_most_seeds(folder: Path):
+    script = runpy.run_path(str(ROOT / "docs" / "make_results.py"))
+    text = f"above{script['BEGINNING']}old{script['END']}below"
+    made = script["readme"](text, folder.parent)
+    assert made.startswith(f"above{script['BEGINNING']}") and made.endswith(f"{script['END']}below")
+    (row,) = [line for line in made.splitlines() if "made-up" in line]
+    assert row.startswith(
+        "| [A fixture of the tests: nobody measured these figures.](docs/results.md#made-up), 1:1 | 5 | "
+    )
+    assert "**300** (IQM 300 (167 to 467)) | 210 (IQM 217 (117 to 317)) |" in row
+    assert row.endswith("| 10 % -> 75 % |") and "old" not in made
+    assert script["readme"](made, folder.parent) == made
+    assert script["readme"](text, folder / "empty") == text
 
 
 def test_the_results_page_says_what_is_better_than_the_paper_and_what_is_not(folder: Path):
