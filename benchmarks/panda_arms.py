@@ -17,7 +17,7 @@ import numpy as np
 from common import arguments_of, circumstances, one_thread, save
 from numpy.typing import NDArray
 
-from oodil.pipeline.environments import make_batch, panda
+from oodil.pipeline.environments import make_batch, panda_arm
 from oodil.pipeline.environments.panda_arm import ALL_JOINTS, BOX_START, TIME_STEP, Arm
 from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.seeding import numpy_rng

@@ -178,4 +178,5 @@ def options(parameter: Any) -> str:
 
 def argument(parameter: Any) -> str:
     """Return how an argument is shown."""
-    return str(parameter.metavar or parameter.name.upper() + "..." * (parameter.nargs == -1))
+    name = str(parameter.metavar or parameter.name.upper())
+    return name + "..." * (parameter.nargs == -1 and not name.endswith("..."))
