@@ -59,9 +59,9 @@ def open_run(path: Path, config: RunConfig, force: Collection[str] = ()) -> Run:
     directory = RunDirectory(path)
     run = Run(config, directory)
     if directory.config.exists():
-        held = read_run(path).config
+        earlier = read_run(path).config
         for field in ("name", "seed", "environment"):
-            old, new = getattr(held, field), getattr(config, field)
+            old, new = getattr(earlier, field), getattr(config, field)
             if old != new:
                 raise ConfigError(
                     f"{path}: holds a run with {field} {_short(old)}, not {_short(new)}; choose another --run-dir"

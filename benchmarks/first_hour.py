@@ -3,7 +3,8 @@
 A fresh virtual environment from the wheel; an environment class in a file beside the YAML, with actions in newtons and
 observations in a dictionary; recordings of two labs in robomimic's format, states under nested keys; the run, its
 verdict, a film, an ONNX model and its first action without oodil. Run ``python benchmarks/first_hour.py --json FILE``
-in the environment of ``make install``; pip is called with ``constraints.txt``, which pins the build of PyTorch.
+in the environment of ``make install``: the newcomer gets the versions of ``constraints.txt`` and that environment's
+build of PyTorch, which pip has to find (``PIP_EXTRA_INDEX_URL`` or ``PIP_FIND_LINKS``).
 """
 
 import os
@@ -12,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from importlib.metadata import distributions
+from importlib.metadata import distributions, version
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from common import arguments_of, circumstances, save
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
+NOT_BUILT = (".*", "build", "runs", "tables", "tests", "docs", "benchmarks", "__pycache__", "*.egg-info")
 KEYS = "robot/base/place,robot/base/speed"
 CONFIG = """\
 name: cart
@@ -81,7 +83,9 @@ class Walk:
 
 def walk(folder: Path, steps: int) -> dict[str, Any]:
     """Go the whole way in an empty folder and return the figures."""
-    wheel = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT)]
+    # Of a copy: setuptools leaves a folder behind where it builds, and takes what is in it the next time.
+    source = shutil.copytree(ROOT, folder / "source", symlinks=True, ignore=shutil.ignore_patterns(*NOT_BUILT))
+    wheel = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(source)]
     subprocess.run(wheel, check=True)
     (built,) = folder.glob("*.whl")
     shutil.copy(EXAMPLES / "cart.py", folder)
@@ -90,7 +94,8 @@ def walk(folder: Path, steps: int) -> dict[str, Any]:
     pip = ("python", "-m", "pip", "install", "--quiet", "--constraint", str(ROOT / "constraints.txt"))
     went = Walk(folder)
     went.step("venv", "python", "-m", "venv", "venv")
-    went.step("install", *pip, str(built))
+    # Of two builds of a version, pip would take one with CUDA where it knows no other index than PyPI.
+    went.step("install", *pip, f"torch=={version('torch')}", str(built))
     core = went.installation()
     went.step("extras", *pip, f"{built}[data,onnx]", "onnxruntime")
     # `python -c` finds cart.py in the present folder; a conversion has no configuration that it could lie beside.

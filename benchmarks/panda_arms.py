@@ -17,8 +17,8 @@ import numpy as np
 from common import arguments_of, circumstances, one_thread, save
 from numpy.typing import NDArray
 
-from oodil.pipeline.environments import make_batch, panda
-from oodil.pipeline.environments.panda import ALL_JOINTS, BOX_START, TIME_STEP, Arm
+from oodil.pipeline.environments import make_batch, panda_arm
+from oodil.pipeline.environments.panda_arm import ALL_JOINTS, BOX_START, TIME_STEP, Arm
 from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.seeding import numpy_rng
 from oodil.pipeline.stages.demonstrations import hand_written
@@ -70,8 +70,8 @@ def two_joints(arms: int, programmes: int) -> dict[str, Any]:
     furthest, tried = BOX_START[0], 0
     for _ in range(arms):
         locked_at = {4: rng.uniform(-2.8, -1.8), 6: rng.uniform(0.2, 3.6)}
-        panda._compile.cache_clear()
-        with patch.dict(panda.LOCKED_ELBOW, locked_at):
+        panda_arm._compile.cache_clear()
+        with patch.dict(panda_arm.LOCKED_ELBOW, locked_at):
             arm = Arm((2, 5), 0.0, 1)
         for _ in range(programmes):
             data = mujoco.MjData(arm.model)

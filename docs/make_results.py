@@ -1,4 +1,4 @@
-"""Write docs/results.md, and its figures, from the committed results: nothing in them is typed by hand.
+"""Write docs/results.md, its figures and the README's table from the committed results: nothing is typed by hand.
 
 Every experiment is a folder of benchmarks/results/experiments/ with the results.json and made.json that `oodil table`
 wrote; a notes.md beside them says why something is as it is.
@@ -15,12 +15,15 @@ from oodil.pipeline.report import formats
 from oodil.pipeline.report.table import Table, read_table
 from oodil.pipeline.report.table.figures import plots
 from oodil.pipeline.report.table.grids import findings
-from oodil.pipeline.report.table.texts import lines, markdown
+from oodil.pipeline.report.table.summary import Entry
+from oodil.pipeline.report.table.texts import lines, markdown, mean, over_seeds
 
 ROOT = Path(__file__).parents[1]
 MEASURED = ROOT / "benchmarks" / "results"
 EXPERIMENTS = MEASURED / "experiments"
-PAGE, FIGURES = ROOT / "docs" / "results.md", ROOT / "docs" / "results"
+PAGE, FIGURES, README = ROOT / "docs" / "results.md", ROOT / "docs" / "results", ROOT / "README.md"
+BEGINNING, END = "\n<!-- results: docs/make_results.py writes this part -->\n", "\n<!-- end of results -->\n"
+NAIVE = "naive_gail"
 
 HEAD = """# Results
 
@@ -61,7 +64,7 @@ def summary(held: dict[str, Table]) -> Iterator[str]:
         done = len(table.records.cells)
         planned = sum(entry.planned for entry in table.entries.values())
         state = "" if done == planned else f" {done} of {formats.plural(planned, 'cell')}."
-        yield f"**[{name}](#{table.records.experiment.lower().replace('.', '')})**:{state} {said}"
+        yield f"**[{name}](#{anchor(table)})**:{state} {said}"
     better: list[tuple[str, ...]] = []
     worse: list[tuple[str, ...]] = []
     for name, table in held.items():
@@ -85,6 +88,42 @@ def summary(held: dict[str, Table]) -> Iterator[str]:
         yield "## Below the paper"
         yield "Reasons, where they were found, stand with each experiment."
         yield lines(head, worse)
+
+
+def readme(text: str, folder: Path = EXPERIMENTS) -> str:
+    """Return the README with the committed results in it, or as it is while there are none.
+
+    It has those rows of each experiment that have the most seeds, if ours and naive GAIL are among its methods.
+    """
+    rows = []
+    for table in tables(folder).values():
+        if not {table.ours, NAIVE} <= set(table.records.methods):
+            continue
+        where = f"[{table.records.caption.partition(',')[0]}](docs/results.md#{anchor(table)})"
+        seeds = {row: len(table.entries[row, table.ours].by_seed) for row in table.records.rows}
+        for row in [row for row, count in seeds.items() if count and count == max(seeds.values())]:
+            each = [table.entries[row, method] for method in (table.ours, NAIVE)]
+            best = table.measure.best(*(entry.found.mean for entry in each if entry.found))
+            shares = [table.by_seed(row, table.ours, figure).values() for figure in ("share_before", "share_after")]
+            told = " -> ".join(formats.percent(sum(share) / len(share)) for share in shares if share) or formats.UNKNOWN
+            rows.append((f"{where}, {row}", str(seeds[row]), *(cell(table, entry, best) for entry in each), told))
+    if not rows:
+        return text
+    head = ("environment and row", "seeds", "ours", "naive GAIL", "share before -> after")
+    above, _, rest = text.partition(BEGINNING)
+    return f"{above}{BEGINNING}\n{lines(head, rows, escape=False)}\n{END}{rest.partition(END)[2]}"
+
+
+def cell(table: Table, entry: Entry, best: float) -> str:
+    """Return the mean of an entry, in bold if it is the best, and its seeds."""
+    shown = mean(table, entry)
+    bold = f"**{shown}**" if entry.found and entry.found.mean == best else shown
+    return f"{bold} ({over_seeds(table, entry)})"
+
+
+def anchor(table: Table) -> str:
+    """Return where an experiment stands on the page."""
+    return table.records.experiment.lower().replace(".", "")
 
 
 def speed() -> str:
@@ -113,8 +152,9 @@ def figures(folder: Path = EXPERIMENTS) -> dict[str, str]:
 
 
 def main() -> None:
-    """Write the page and its figures; figures that it no longer has are removed."""
+    """Write page, README and figures; figures that the page no longer has are removed."""
     PAGE.write_text(page(), encoding="utf-8")
+    README.write_text(readme(README.read_text(encoding="utf-8")), encoding="utf-8")
     shutil.rmtree(FIGURES, ignore_errors=True)
     drawn = figures()
     if drawn:

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from pydantic import BaseModel
+from pydantic import BaseModel, JsonValue
 from pydantic.fields import FieldInfo
 from sphinx.application import Sphinx
 from sphinx.util import logging
@@ -123,6 +123,8 @@ def described(annotation: Any) -> str:
         return " or ".join(map(described, arguments))
     if origin is tuple:
         return f"list of {described(arguments[0])}"
+    if annotation is JsonValue:
+        return "values"
     if origin is dict:
         return f"mapping of {described(arguments[0])} to {described(arguments[1])}"
     return WORDS[annotation]
@@ -176,4 +178,5 @@ def options(parameter: Any) -> str:
 
 def argument(parameter: Any) -> str:
     """Return how an argument is shown."""
-    return str(parameter.metavar or parameter.name.upper() + "..." * (parameter.nargs == -1))
+    name = str(parameter.metavar or parameter.name.upper())
+    return name + "..." * (parameter.nargs == -1 and not name.endswith("..."))

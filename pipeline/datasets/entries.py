@@ -18,6 +18,9 @@ REWARDS = ("rewards", "rews", "reward", "next.reward")
 TERMINATED = ("terminals", "terminations", "terminated", "terminal")
 TRUNCATED = ("timeouts", "truncations", "truncated")
 
+OURS = "oodil_"
+"""How what an export adds is called; what an earlier one added goes when new comes."""
+
 Keys = tuple[str, ...]
 """Which entries make up a state, in this order; empty where there is no choice."""
 

@@ -1,7 +1,7 @@
 """Demonstrations from elsewhere, whatever their format, for ``oodil demos convert`` and ``oodil score``."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.datasets import hdf5, layouts, lerobot, minari, npz, official
+from oodil.pipeline.datasets.columns import Warn
 from oodil.pipeline.datasets.native import read_demonstrations
 from oodil.pipeline.errors import DataError
-
-Warn = Callable[[str], None]
 
 _MINARI = "minari:"
 FORMATS = "FILE.npz, FILE.hdf5, FILE.pkl, FILE.parquet, a folder of LeRobot's or minari:DATASET_ID"

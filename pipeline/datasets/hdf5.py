@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.datasets import layouts
 from oodil.pipeline.datasets.columns import Warn
+from oodil.pipeline.datasets.entries import OURS
 from oodil.pipeline.errors import DataError, StorageError
-
-_OURS = "oodil_"
-"""How masks and attributes of ours begin; those of an earlier export go when new ones come."""
 
 
 def read(path: Path, keys: tuple[str, ...], warn: Warn) -> tuple[list[Episode], str]:
@@ -81,18 +79,18 @@ def _mark(file: Any, transferable: NDArray[np.bool_], columns: Mapping[str, NDAr
     if len(found) != len(transferable):
         raise DataError(f"{file.filename}: has no groups such as data/demo_0 that could be marked; export to FILE.csv")
     names = np.array(found)
-    for mask in [name for name in file.get("mask", ()) if name.startswith(_OURS)]:
+    for mask in [name for name in file.get("mask", ()) if name.startswith(OURS)]:
         del file[f"mask/{mask}"]
     masks = {"transferable": transferable}
     masks |= {f"cluster_{k}": columns["cluster"] == k for k in np.unique(columns["cluster"])}
     for mask, members in masks.items():
-        file[f"mask/{_OURS}{mask}"] = np.array(names[members], "S")
+        file[f"mask/{OURS}{mask}"] = np.array(names[members], "S")
     for n, name in enumerate(found):
         attributes = group[name].attrs
-        for old in [each for each in attributes if each.startswith(_OURS)]:
+        for old in [each for each in attributes if each.startswith(OURS)]:
             del attributes[old]
         for column, values in columns.items():
-            attributes[f"{_OURS}{column}"] = values[n].item()
+            attributes[f"{OURS}{column}"] = values[n].item()
 
 
 def _environment(file: Any) -> str:

@@ -10,11 +10,8 @@ from numpy.typing import NDArray
 from oodil.pipeline.artifacts import write_file
 from oodil.pipeline.data import Episode
 from oodil.pipeline.datasets import layouts
-from oodil.pipeline.datasets.entries import STATES, TERMINATED
+from oodil.pipeline.datasets.entries import OURS, STATES, TERMINATED
 from oodil.pipeline.errors import DataError
-
-_OURS = "oodil_"
-"""How metadata of ours begins; that of an earlier export goes when new comes."""
 
 
 def read(dataset_id: str, keys: tuple[str, ...]) -> tuple[list[Episode], str]:
@@ -44,7 +41,7 @@ def write_metadata(dataset_id: str, columns: Mapping[str, NDArray[Any]]) -> None
     """Add ``oodil_*`` entries to the metadata of the (N,) episodes of a data set; what we added before goes."""
     dataset = _local(dataset_id)
     indices = [int(index) for index in dataset.episode_indices]
-    rows = [{f"{_OURS}{name}": column[n].item() for name, column in columns.items()} for n in range(len(indices))]
+    rows = [{f"{OURS}{name}": column[n].item() for name, column in columns.items()} for n in range(len(indices))]
     _forget(dataset.storage, indices)
     dataset.storage.update_episode_metadata(rows, indices)
 
@@ -58,12 +55,12 @@ def _forget(storage: Any, indices: list[int]) -> None:
         with h5py.File(folder / "main_data.hdf5", "r+") as file:
             for index in indices:
                 attributes = file[f"episode_{index}"].attrs
-                for old in [name for name in attributes if name.startswith(_OURS)]:
+                for old in [name for name in attributes if name.startswith(OURS)]:
                     del attributes[old]
         return
     for path in (folder / str(index) / "metadata.json" for index in indices):
         if path.exists():
-            kept = {name: value for name, value in json.loads(path.read_text()).items() if not name.startswith(_OURS)}
+            kept = {name: value for name, value in json.loads(path.read_text()).items() if not name.startswith(OURS)}
             write_file(path, json.dumps(kept).encode())
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.datasets import layouts, official
 from oodil.pipeline.datasets.columns import Warn
+from oodil.pipeline.datasets.entries import OURS
 from oodil.pipeline.errors import DataError
 
 
@@ -55,7 +56,7 @@ def read(path: Path, keys: tuple[str, ...], warn: Warn) -> list[Episode]:
 def encode(demonstrations: Demonstrations, columns: Mapping[str, NDArray[Any]]) -> bytes:
     """Return an archive of ``observations`` and ``offsets``, with an array ``oodil_*`` for each (N,) column."""
     content = io.BytesIO()
-    found = {f"oodil_{name}": column for name, column in columns.items()}
+    found = {f"{OURS}{name}": column for name, column in columns.items()}
     arrays: dict[str, Any] = {"observations": demonstrations.observations, "offsets": demonstrations.offsets} | found
     np.savez(content, **arrays)
     return content.getvalue()

@@ -18,7 +18,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from oodil.pipeline.report.formats import count
-from oodil.pipeline.report.looks import GRID, INK, LINES, MUTED, on_any_paper
+from oodil.pipeline.report.looks import GRID, INK, LINES, MUTED
 
 MOST_AS_VECTORS = 3000
 """With more demonstrations, dots become a bitmap inside the SVG; as vectors they would take megabytes."""
@@ -95,4 +95,4 @@ def drawing(name: str, width: float, height: float) -> Iterator[tuple[Figure, io
     element = drawn.getvalue()
     element = re.sub(r"<metadata>.*?</metadata>", "", element[element.index("<svg") :], flags=re.DOTALL)
     # Identifiers of groups (axes_1, ...) repeat in every figure, and nothing refers to them.
-    svg.write(on_any_paper(re.sub(r'(<g) id="[^"]*"', r"\1", element).strip()))
+    svg.write(re.sub(r'(<g) id="[^"]*"', r"\1", element).strip())

@@ -10,7 +10,8 @@ from gymnasium.utils.env_checker import check_env
 
 from oodil.pipeline.data import Episode
 from oodil.pipeline.environments import make_batch
-from oodil.pipeline.environments.panda import ALL_JOINTS, Arm, judge, start_angles
+from oodil.pipeline.environments.panda import judge
+from oodil.pipeline.environments.panda_arm import ALL_JOINTS, Arm, start_angles
 from oodil.pipeline.errors import OodilError
 from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.seeding import numpy_rng

@@ -1,17 +1,15 @@
 """The page of a table: everything that the template shows, as one typed structure, and its HTML."""
 
 from dataclasses import dataclass
-from functools import cache
 
-import jinja2
 from markupsafe import Markup
 
 from oodil.pipeline.report import formats
+from oodil.pipeline.report.pages import page
 from oodil.pipeline.report.table.figures import method_looks, plots
 from oodil.pipeline.report.table.grids import Grid, findings, grids, notes
 from oodil.pipeline.report.table.summary import Table
 from oodil.pipeline.report.table.texts import deviation, explained, how_made, mean, over_seeds
-from oodil.pipeline.report.table.theme import dark_colors, paint, themed
 
 CAPTIONS = {
     "seeds": "Every point is a seed. A stroke is the mean, a bar the interval of the interquartile mean, or one "
@@ -42,7 +40,7 @@ class Method:
     """A column of the table and how it is drawn."""
 
     title: str
-    paint: str
+    color: str
     glyph: str
     dashed: bool
 
@@ -72,7 +70,6 @@ class TablePage:
     panels: tuple[Panels, ...]
     grids: tuple[Grid, ...]
     made: str
-    dark: str
 
 
 def context(table: Table) -> TablePage:
@@ -89,7 +86,7 @@ def context(table: Table) -> TablePage:
         findings=tuple(findings(table)),
         notes=tuple(notes(table)),
         methods=tuple(
-            Method(records.methods[name], paint(look.color), look.glyph, look.dashes == "dashed")
+            Method(records.methods[name], look.color, look.glyph, look.dashes == "dashed")
             for name, look in looks.items()
         ),
         rows=tuple(
@@ -113,27 +110,15 @@ def context(table: Table) -> TablePage:
                 TITLES[plot.name],
                 CAPTIONS[plot.name],
                 not plot.named and plot.name != "clusters",
-                tuple((name, themed(svg)) for name, svg in plot.each()),
+                tuple(plot.each()),
             )
             for plot in plots(table)
         ),
         grids=grids(table),
         made=how_made(records.made),
-        dark=dark_colors(),
     )
 
 
 def render(table: Table) -> str:
     """Return the HTML of the page."""
-    return _environment().get_template("table.html.j2").render(page=context(table), head=table.records.methods.values())
-
-
-@cache
-def _environment() -> jinja2.Environment:
-    return jinja2.Environment(
-        loader=jinja2.PackageLoader("oodil.pipeline.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    return page("table.html.j2", page=context(table), head=table.records.methods.values())

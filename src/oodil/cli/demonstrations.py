@@ -19,7 +19,9 @@ from oodil.cli.options import (
 from oodil.pipeline.errors import DataError
 
 
-def inspect_demos(path: Annotated[Path, typer.Argument(help="A file of demonstrations, or a run's folder.")]) -> None:
+def inspect_demos(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="A file of demonstrations, or a run's folder.")],
+) -> None:
     """Show what a set of demonstrations contains."""
     from oodil.api import open_run
     from oodil.pipeline.datasets import read_demonstrations
@@ -71,7 +73,10 @@ def collect_demos(
 def convert_demos(
     sources: Annotated[
         list[str],
-        typer.Argument(help="FILE.npz, FILE.hdf5, FILE.pkl, FILE.parquet, a folder of LeRobot's, minari:DATASET_ID."),
+        typer.Argument(
+            metavar="SOURCE",
+            help="FILE.npz, FILE.hdf5, FILE.pkl, FILE.parquet, a folder of LeRobot's, minari:DATASET_ID.",
+        ),
     ],
     environment: Annotated[str, typer.Option(help="Id of the imitator's environment, such as oodil/Hopper-v0.")],
     output: Annotated[Path, typer.Option(help="The file to write.")] = Path("demonstrations.safetensors"),
@@ -112,7 +117,9 @@ def convert_demos(
 
 def export_demos(
     run_dir: RunPath,
-    target: Annotated[str, typer.Argument(help="FILE.csv, FILE.hdf5 (robomimic) or minari:DATASET_ID.")],
+    target: Annotated[
+        str, typer.Argument(metavar="TARGET", help="FILE.csv, FILE.hdf5 (robomimic) or minari:DATASET_ID.")
+    ],
 ) -> None:
     """Write cluster, score with interval, verdict and weight of every demonstration to a table, or to their origin."""
     from oodil.api import open_run

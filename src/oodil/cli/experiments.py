@@ -1,13 +1,13 @@
 """The command that makes a table or a figure: rows x methods x seeds, as many runs at once as there are cores."""
 
-import os
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from oodil.cli.options import EXIT_STOPPED, EngineName, TrustCluster, engine_of
+from oodil.cli.options import EngineName, TrustCluster, engine_of, shown
 from oodil.pipeline.errors import UnfinishedError
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ def table(
     folder: Annotated[Path, typer.Option(help="Where the experiment has its folder.")] = Path("tables"),
 ) -> None:
     """Make a table of an experiment; what is finished is reused, what was interrupted goes on."""
+    from oodil.estimate import usable_cores
     from oodil.experiments import Table
     from oodil.pipeline.experiment import load_experiment
     from oodil.pipeline.report.table import write_table
@@ -41,50 +42,41 @@ def table(
         experiment = experiment.with_seeds(seeds)
     made = Table.of(experiment, folder / experiment.name)
     selected = made.select(rows, methods)
-    cores = os.cpu_count() or 1
     if plan:
-        _print_plan(made, selected, cores if workers is None else max(workers, 1))
+        _print_plan(made, selected, usable_cores() if workers is None else max(workers, 1))
         return
-    count = cores if workers is None and engine == "local" else workers
-    outcome = _compute(made, selected, engine_of(made.runs[0].config, engine, count, trust_cluster=trust_cluster))
+    count = usable_cores() if workers is None and engine == "local" else workers
+    where = engine_of(made.runs[0].config, engine, count, trust_cluster=trust_cluster)
+    command = shlex.join(["oodil", *sys.argv[1:]])
+    outcome = _compute(made, selected, where, command)
     made.write_results(outcome.failed, sys.argv[1:])
     print(write_table(made.folder))
     if outcome.failed or outcome.stopped:
-        raise UnfinishedError(_unfinished(outcome, sys.argv[1:]), made.experiment.name, outcome.failed)
+        raise UnfinishedError(_unfinished(outcome, command), made.experiment.name, outcome.failed)
 
 
-def _compute(made: "Table", selected: "dict[str, list[Stage]]", engine: "Engine") -> "Outcome":
-    """Compute and show how far the runs are; Ctrl-C once stops politely, twice at once."""
+def _compute(made: "Table", selected: "dict[str, list[Stage]]", engine: "Engine", command: str) -> "Outcome":
+    """Compute and show how far the runs are."""
     from oodil.estimate import outlook, table_cost
-    from oodil.terminal import Display, stop_flag
     from oodil.workers.reports import DONE, Event, Finished
 
-    cost = table_cost(outlook(made, selected), engine.workers)
-    try:
-        with Display(cost) as display, stop_flag(display.stopping) as is_asked_to_stop:
+    with shown(table_cost(outlook(made, selected), engine.workers), command) as (display, should_stop):
 
-            def should_stop() -> bool:
-                display.tick()
-                return is_asked_to_stop()
+        def on_event(event: Event) -> None:
+            display.event(event)
+            if event.report == Finished(DONE):
+                display.say(f"✓ {event.name}", "green")
 
-            def on_event(event: Event) -> None:
-                display.event(event)
-                if event.report == Finished(DONE):
-                    display.say(f"✓ {event.name}", "green")
-
-            display.stage_started("table", "", len(selected))
-            return made.compute(selected, engine, on_event, should_stop)
-    except KeyboardInterrupt:
-        print("\nstopped at once; go on with the same command", file=sys.stderr)
-        raise typer.Exit(EXIT_STOPPED) from None
+        display.stage_started("table", "", len(selected))
+        return made.compute(selected, engine, on_event, should_stop)
 
 
-def _unfinished(outcome: "Outcome", arguments: list[str]) -> str:
+def _unfinished(outcome: "Outcome", command: str) -> str:
     failures = "".join(f"{run} failed:\n{reason.rstrip()}\n\n" for run, reason in sorted(outcome.failed.items()))
     named = f" ({', '.join(sorted(outcome.failed))})" if outcome.failed else ""
     return (
         f"{failures}{len(outcome.done)} runs done, {len(outcome.failed)} failed{named}, {len(outcome.not_run)} not "
-        f"finished. What is finished is kept; go on with: oodil {' '.join(arguments)}"
+        f"finished. What is finished is kept; go on with: {command}"
     )
 
 
@@ -96,15 +88,15 @@ def _print_plan(made: "Table", selected: "dict[str, list[Stage]]", workers: int)
     from oodil.estimate import outlook, table_cost
 
     console, found = Console(), outlook(made, selected)
-    shown = Columns(box=None, padding=(0, 2))
-    shown.add_column("run", no_wrap=True)
+    columns = Columns(box=None, padding=(0, 2))
+    columns.add_column("run", no_wrap=True)
     for heading in ("environment steps", "to compute", "finished"):
-        shown.add_column(heading, justify="right")
-    shown.add_column("taken over from another run")
+        columns.add_column(heading, justify="right")
+    columns.add_column("taken over from another run")
     for each in found:
         counts = f"{each.cost.env_steps:,}", str(len(each.own)), str(len(each.finished))
-        shown.add_row(each.name, *counts, ", ".join(each.shared))
-    console.print(shown)
+        columns.add_row(each.name, *counts, ", ".join(each.shared))
+    console.print(columns)
     own, shared, done = (
         sum(len(stages) for stages in kind)
         for kind in zip(*((each.own, each.shared, each.finished) for each in found), strict=True)

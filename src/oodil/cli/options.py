@@ -1,6 +1,8 @@
 """What commands have in common: their options, and how the chosen stages are executed and shown."""
 
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -9,8 +11,10 @@ import typer
 from oodil.pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
+    from oodil.estimate import RunCost
     from oodil.pipeline.config import RunConfig
     from oodil.pipeline.stage import Run, Stage
+    from oodil.terminal import Display
     from oodil.workers.engine import Engine
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_STOPPED = 1, 2, 130
@@ -91,12 +95,23 @@ def execute_and_report(opened: "Run", chosen: "list[Stage]", engine: "Engine", f
 
 
 def show_execution(opened: "Run", chosen: "list[Stage]", engine: "Engine", force: list[str] | None = None) -> None:
-    """Execute the stages and show how far they are; Ctrl-C once stops politely, twice at once."""
+    """Execute the stages and show how far they are."""
     from oodil.estimate import run_cost
     from oodil.orchestrator import execute
-    from oodil.terminal import Display, stop_flag
 
     cost = run_cost(opened, chosen, engine.workers, force or ())
+    with shown(cost, f"oodil resume {opened.directory.path}") as (display, should_stop):
+        execute(opened, chosen, engine, display, should_stop, force or ())
+
+
+@contextmanager
+def shown(cost: "RunCost", resume: str) -> "Iterator[tuple[Display, Callable[[], bool]]]":
+    """Show what is computed; give the display, and what tells whether to stop.
+
+    Ctrl-C once stops politely; twice at once, which names the command that goes on.
+    """
+    from oodil.terminal import Display, stop_flag
+
     try:
         with Display(cost) as display, stop_flag(display.stopping) as is_asked_to_stop:
 
@@ -104,7 +119,7 @@ def show_execution(opened: "Run", chosen: "list[Stage]", engine: "Engine", force
                 display.tick()  # Engines ask all the time, also while nothing is reported.
                 return is_asked_to_stop()
 
-            execute(opened, chosen, engine, display, should_stop, force or ())
+            yield display, should_stop
     except KeyboardInterrupt:
-        print(f"\nstopped at once; go on with: oodil resume {opened.directory.path}", file=sys.stderr)
+        print(f"\nstopped at once; go on with: {resume}", file=sys.stderr)
         raise typer.Exit(EXIT_STOPPED) from None
