@@ -15,7 +15,7 @@ import oodil
 
 ROOT = Path(__file__).parents[1]
 MICRO = ROOT / "tests" / "micro.yaml"
-PATIENCE_S = 120.0
+PATIENCE_S = 250.0
 
 
 class LiveRun:

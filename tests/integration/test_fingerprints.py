@@ -29,6 +29,8 @@ IRRELEVANT = [
     "runtime.max_attempts=9",
     "runtime.max_worker_restarts=9",
     "runtime.restart_delay_s=9",
+    "runtime.modules=elsewhere",
+    "runtime.logger=wandb",
 ]
 MARKS = "demonstrations.sources.1.transferable=true"
 RELEVANT = {
