@@ -46,10 +46,28 @@ class Newtons(Carts):
         return super().step(action)
 
 
+class Strong(Carts):
+    """Carts that are pushed with forces a thousand times as large, to the same effect."""
+
+    action_space = spaces.Box(-1000.0, 1000.0, (3,), np.float32)
+
+    def push(self, action: NDArray[Any]) -> NDArray[np.float64]:
+        return super().push(action) / 1000
+
+
 class Gears(Newtons):
     """Takes whole numbers."""
 
     action_space = spaces.Box(-5, 5, (3,), np.int64)
+
+
+class Leaves(Carts):
+    """Ends the process at its third step, as simulators with a window do."""
+
+    def step(self, action: Any) -> Step:
+        if self.t == 2:
+            raise SystemExit("the simulator left")
+        return super().step(action)
 
 
 class Broadcast(Carts):
