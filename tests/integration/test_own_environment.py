@@ -74,6 +74,19 @@ def test_a_module_beside_the_configuration_is_found_in_every_process(folder: Pat
     assert code == 0 and "length 60" in output, output
 
 
+def test_a_conversion_finds_the_module_in_the_current_folder_or_beside_what_it_writes(folder: Path) -> None:
+    np.savez(folder / "mine.npz", *np.zeros((2, 9, 6)))
+    (folder / "elsewhere").mkdir()
+    for at, source, output in (
+        (folder, "mine.npz", "elsewhere/all.safetensors"),
+        (folder / "elsewhere", "../mine.npz", "../all.safetensors"),
+    ):
+        code, said = oodil("demos", "convert", source, "--environment", ENV_ID, "--output", output, cwd=at)
+        assert code == 0 and (at / output).is_file(), said
+    code, said = oodil("demos", "convert", "../mine.npz", "--environment", ENV_ID, cwd=folder / "elsewhere")
+    assert code == 2 and f"{MODULE} has to lie" in said and "in the current folder" in said
+
+
 def test_modules_of_general_names_on_the_path_do_no_harm(folder: Path) -> None:
     for name in ("workers", "pipeline", "terminal", "orchestrator", "configs", "cli", "api", "bench"):
         (folder / f"{name}.py").write_text("raise ImportError('not yours')")

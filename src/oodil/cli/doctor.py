@@ -1,6 +1,5 @@
 """The command that looks at a machine: what is there, how fast it is, and what to do about what is missing."""
 
-import ctypes.util
 import json
 import os
 import platform
@@ -21,8 +20,9 @@ REFERENCE_STEPS_PER_S = 15_000
 FREE_GB = 2.0
 """What a long run and its report may take."""
 EXTRAS = {
-    "data": ("minari", "h5py"),
+    "data": ("minari", "h5py", "pyarrow"),
     "driving": ("highway-env",),
+    "onnx": ("onnx",),
     "ray": ("ray",),
     "robot": ("robosuite",),
     "tensorboard": ("tensorboard",),
@@ -130,8 +130,9 @@ def _disk() -> Iterator[Finding]:
 
 def _rendering() -> Iterator[Finding]:
     """Make a picture; it comes last, because a broken driver may end the process."""
-    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl" if ctypes.util.find_library("EGL") else "osmesa")
+    from oodil.pipeline.environments.pictures import choose_backend
+
+    choose_backend()
     backend = os.environ.get("MUJOCO_GL", "glfw")
     advice = "only films need it; apt-get install libegl1, or libosmesa6 and MUJOCO_GL=osmesa"
     try:
