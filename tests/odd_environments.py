@@ -153,6 +153,31 @@ class Far(Carts):
         return super().push(action) + (random.random() if self.x.max() > 1.3 else 0)
 
 
+class Tired(Carts):
+    """Fails soon after the nine episodes of a trial."""
+
+    steps = 0
+
+    def step(self, action: Any) -> Step:
+        Tired.steps += 1
+        if Tired.steps > 560:
+            raise OSError("no more")
+        return super().step(action)
+
+
+class Blinded(Carts):
+    """Sees nothing any more soon after the nine episodes of a trial."""
+
+    steps = 0
+
+    def step(self, action: Any) -> Step:
+        Blinded.steps += 1
+        return super().step(action)
+
+    def seen(self) -> Any:
+        return super().seen() * np.float32(np.nan if Blinded.steps > 560 else 1)
+
+
 class Single(Carts):
     """One simulator in a process."""
 

@@ -152,6 +152,8 @@ def _why_unmade(env_id: str, error: Exception) -> str:
         ) * is_own
     elif isinstance(error, ImportError) and (newer := _newest(env_id)):
         hint = f"; there is {newer}"
+    elif isinstance(error, gymnasium.error.UnregisteredEnv) and ":" not in env_id:
+        hint = f"; one that a module of yours registers is called MODULE:{env_id}"
     elif isinstance(error, FileNotFoundError) and error.filename and not os.path.isabs(error.filename):
         hint = (
             f"; it is looked for in {os.getcwd()}, where the program was started: let the environment find its files "
