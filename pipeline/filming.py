@@ -87,6 +87,8 @@ def picture(simulators: VisibleSimulators) -> NDArray[np.uint8]:
     """Return a picture of the first simulator. Raises UnusableEnvironmentError, with what is missing."""
     try:
         return simulators.render(0)
+    except UnusableEnvironmentError:
+        raise
     except Exception as error:  # Whatever a foreign environment or a machine's OpenGL raises.
         raise UnusableEnvironmentError(
             f"cannot render here ({error}); a machine without a display needs EGL or OSMesa "

@@ -89,4 +89,6 @@ def _to_action_space(graph: _Graph, policy: Policy) -> None:
     graph.then("Mul", "scaled", half=half)
     graph.then("Add", "moved", middle=middle)
     graph.then("Max", "raised", low=policy.action_low)
-    graph.then("Min", "action", high=policy.action_high)
+    graph.then("Min", "lowered" if policy.acts_in_integers else "action", high=policy.action_high)
+    if policy.acts_in_integers:
+        graph.then("Round", "action")

@@ -122,20 +122,19 @@ def _by_source(results: RunResults, found: Transferability) -> dict[str, dict[st
 class _RandomActions:
     """Acts at random, evenly between the bounds; where there is none, between -1 and 1."""
 
-    def __init__(self, low: NDArray[np.float32], high: NDArray[np.float32], rng: np.random.Generator) -> None:
-        self._low = np.where(np.isfinite(low), low, -1.0)
-        self._high = np.where(np.isfinite(high), high, 1.0)
+    def __init__(self, action_dim: int, rng: np.random.Generator) -> None:
+        self._action_dim = action_dim
         self._rng = rng
 
     def mean(self, observations: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return (G, A) actions."""
-        return self._rng.uniform(self._low, self._high, (len(observations), len(self._low))).astype(np.float32)
+        """Return (G, A) actions in units of the action space."""
+        return self._rng.uniform(-1, 1, (len(observations), self._action_dim)).astype(np.float32)
 
 
 def random_return(environment: EnvironmentConfig) -> float:
     """Return the mean true return of random actions."""
     spec, rng = environment_spec(environment.id, environment.dynamics), numpy_rng(derive_key(0, "random actions"))
-    return _mean_return(environment, _RandomActions(spec.action_low.ravel(), spec.action_high.ravel(), rng))
+    return _mean_return(environment, _RandomActions(spec.action_dim, rng))
 
 
 def expert_return(config: RunConfig) -> float | None:

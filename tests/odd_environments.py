@@ -46,10 +46,28 @@ class Newtons(Carts):
         return super().step(action)
 
 
+class Strong(Carts):
+    """Carts that are pushed with forces a thousand times as large, to the same effect."""
+
+    action_space = spaces.Box(-1000.0, 1000.0, (3,), np.float32)
+
+    def push(self, action: NDArray[Any]) -> NDArray[np.float64]:
+        return super().push(action) / 1000
+
+
 class Gears(Newtons):
     """Takes whole numbers."""
 
     action_space = spaces.Box(-5, 5, (3,), np.int64)
+
+
+class Leaves(Carts):
+    """Ends the process at its third step, as simulators with a window do."""
+
+    def step(self, action: Any) -> Step:
+        if self.t == 2:
+            raise SystemExit("the simulator left")
+        return super().step(action)
 
 
 class Broadcast(Carts):
@@ -133,6 +151,31 @@ class Far(Carts):
 
     def push(self, action: NDArray[Any]) -> NDArray[np.float64]:
         return super().push(action) + (random.random() if self.x.max() > 1.3 else 0)
+
+
+class Tired(Carts):
+    """Fails soon after the nine episodes of a trial."""
+
+    steps = 0
+
+    def step(self, action: Any) -> Step:
+        Tired.steps += 1
+        if Tired.steps > 560:
+            raise OSError("no more")
+        return super().step(action)
+
+
+class Blinded(Carts):
+    """Sees nothing any more soon after the nine episodes of a trial."""
+
+    steps = 0
+
+    def step(self, action: Any) -> Step:
+        Blinded.steps += 1
+        return super().step(action)
+
+    def seen(self) -> Any:
+        return super().seen() * np.float32(np.nan if Blinded.steps > 560 else 1)
 
 
 class Single(Carts):

@@ -33,6 +33,11 @@ def is_ours(env_id: str) -> bool:
     return env_id.rpartition(":")[2].startswith("oodil/")
 
 
+def is_same(env_id: str, other: str) -> bool:
+    """Return whether two ids are of one environment: the module that registers it is no part of its name."""
+    return env_id.rpartition(":")[2] == other.rpartition(":")[2]
+
+
 def dynamics_of(env_id: str, dynamics: Dynamics) -> Dynamics:
     """Return dynamics as an environment is given them: those of ours are numbers, and 12 is 12.0.
 

@@ -122,6 +122,14 @@ def joined(tree: Any, paths: Sequence[str]) -> NDArray[Any]:
 
 
 def next_paths(tree: Any, paths: Sequence[str]) -> list[str]:
-    """Return the paths of the states that follow, called ``next_...``; empty unless all are there."""
-    following = [f"next_{path}" for path in paths]
-    return following if all(find(tree, path) is not None for path in following) else []
+    """Return the paths of the states that follow, called ``next_...``; empty unless all are there.
+
+    What is ``obs`` may be followed by ``next_observations``, but not by ``next_states``, which are something else.
+    """
+    head = paths[0].partition("/")[0]
+    for name in (head, *(each for each in STATES if head in STATES and each[:3] == head[:3])):
+        called = [name + path.removeprefix(head) if path.startswith(head) else path for path in paths]
+        following = [f"next_{path}" for path in called]
+        if all(find(tree, path) is not None for path in following):
+            return following
+    return []

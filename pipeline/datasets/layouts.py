@@ -109,6 +109,9 @@ def _of_entries(content: Mapping[str, Any], paths: list[str]) -> Episode:
 
 
 def _of_mapping(content: Mapping[str, Any], keys: Keys, warn: Warn) -> list[Episode]:
+    alone = _alone(content)
+    if alone is not None and not keys:
+        return episodes(alone, keys, warn)
     group, names = numbered(content, keys)
     if names:
         return [episode(group[name], keys, f"demonstration {n} ({name})") for n, name in enumerate(names)]
@@ -132,6 +135,22 @@ def _of_mapping(content: Mapping[str, Any], keys: Keys, warn: Warn) -> list[Epis
         )
         for n, limit in enumerate(limits)
     ]
+
+
+def _alone(content: Mapping[str, Any]) -> Any:
+    """Return the one entry that there is, if it holds demonstrations one by one; None otherwise.
+
+    ``numpy.savez`` calls it ``arr_0`` where it is given no name, and makes an array without axes of a dictionary.
+    """
+    name = next(iter(content), "")
+    if len(content) != 1 or (name != "arr_0" and re.search(r"\d$", str(name))):
+        return None
+    value = content[name]
+    if isinstance(value, np.ndarray) and not value.ndim:
+        return value.item() if value.dtype == object else None
+    if not _is_list(value):
+        return None
+    return list(value) if isinstance(value, list | tuple) else np.asarray(value)
 
 
 def numbered(content: Mapping[str, Any], keys: Keys) -> tuple[Mapping[str, Any], list[Any]]:

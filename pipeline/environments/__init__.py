@@ -15,7 +15,13 @@ from gymnasium.envs.registration import find_highest_version, get_env_id, parse_
 from numpy.typing import NDArray
 
 from oodil.pipeline.environments.batch import Simulators, stop_the_clock
-from oodil.pipeline.environments.foreign import ForeignEnvironment, box_spaces, can_be_placed, unplaceable
+from oodil.pipeline.environments.foreign import (
+    ForeignEnvironment,
+    box_spaces,
+    can_be_placed,
+    takes_integers,
+    unplaceable,
+)
 from oodil.pipeline.environments.registration import register_environments
 from oodil.pipeline.environments.replay import ReplayBatch, refuse_randomness
 from oodil.pipeline.errors import UnusableEnvironmentError
@@ -35,6 +41,8 @@ class EnvironmentSpec:
     action_low: NDArray[np.float32]
     """In the shape of the action space, and in its own numbers."""
     action_high: NDArray[np.float32]
+    acts_in_integers: bool
+    """Whether the action space holds whole numbers."""
     can_be_placed: bool
     """Whether its simulators can be put into an observed state (`Simulators.place`)."""
 
@@ -50,9 +58,11 @@ def environment_spec(env_id: str, dynamics: Mapping[str, Any]) -> EnvironmentSpe
     env, limit = _make(env_id, dynamics)
     seen, action = box_spaces(env)
     low, high = np.asarray(action.low, np.float32), np.asarray(action.high, np.float32)
-    placeable = hasattr(env.unwrapped, "batched") or can_be_placed(env)
+    placeable, whole = hasattr(env.unwrapped, "batched") or can_be_placed(env), takes_integers(action)
     env.close()
-    return EnvironmentSpec(math.prod(seen.shape), math.prod(action.shape), limit, seen.shape, low, high, placeable)
+    return EnvironmentSpec(
+        math.prod(seen.shape), math.prod(action.shape), limit, seen.shape, low, high, whole, placeable
+    )
 
 
 def make_batch(env_id: str, dynamics: Mapping[str, Any], num_simulators: int) -> Simulators:
@@ -136,9 +146,14 @@ def _why_unmade(env_id: str, error: Exception) -> str:
     if isinstance(error, ModuleNotFoundError):
         module = env_id.partition(":")[0].partition(".")[0]
         is_own = f"No module named '{module}'" in said
-        hint = f"; {module} has to lie beside the configuration file, or on PYTHONPATH" if is_own else ""
+        hint = (
+            f"; {module} has to lie beside the configuration file or, for oodil demos convert, in the current folder, "
+            "or on PYTHONPATH"
+        ) * is_own
     elif isinstance(error, ImportError) and (newer := _newest(env_id)):
         hint = f"; there is {newer}"
+    elif isinstance(error, gymnasium.error.UnregisteredEnv) and ":" not in env_id:
+        hint = f"; one that a module of yours registers is called MODULE:{env_id}"
     elif isinstance(error, FileNotFoundError) and error.filename and not os.path.isabs(error.filename):
         hint = (
             f"; it is looked for in {os.getcwd()}, where the program was started: let the environment find its files "

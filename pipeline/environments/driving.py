@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from oodil.pipeline.data import Snapshot
 from oodil.pipeline.environments.batch import StepOutcome
+from oodil.pipeline.errors import UnusableEnvironmentError
 
 Floats = NDArray[np.float64]
 
@@ -197,9 +198,14 @@ def _things(world: Layout) -> tuple[list[Any], Any]:
 
 def draw(world: Layout, x: float, y: float, heading: float) -> NDArray[np.uint8]:
     """Return the world with a car as seen from above (height, width, 3)."""
-    import pygame
-    from highway_env.road.graphics import RoadObjectGraphics, WorldSurface
-    from highway_env.vehicle.graphics import VehicleGraphics
+    try:
+        import pygame
+        from highway_env.road.graphics import RoadObjectGraphics, WorldSurface
+        from highway_env.vehicle.graphics import VehicleGraphics
+    except ImportError as error:
+        raise UnusableEnvironmentError(
+            f"driving is drawn by highway-env, and {error.name} is not installed; pip install 'oodil[driving]'"
+        ) from error
 
     scale = 10
     size = (int(WIDTH * scale), int(HEIGHT * scale))

@@ -66,6 +66,11 @@ def _is_image(space: gymnasium.spaces.Box) -> bool:
     return as_bytes or (len(space.shape) >= 3 and sorted(space.shape)[-2] >= 8)
 
 
+def takes_integers(space: gymnasium.spaces.Box) -> bool:
+    """Return whether a space holds whole numbers; what is between them is rounded."""
+    return np.dtype(space.dtype).kind in "iu"
+
+
 def can_be_placed(env: gymnasium.Env[Any, Any]) -> bool:
     """Return whether an environment has a method ``place(observation)``, which returns what it then observes."""
     return hasattr(env.unwrapped, "place")
@@ -90,7 +95,7 @@ class ForeignEnvironment:
         self._seen, self._space = box_spaces(env)
         self._low, self._high = (np.asarray(bound, np.float64) for bound in (self._space.low, self._space.high))
         self._middle, self._half = action_units(self._low, self._high)
-        self._acts_in_integers = np.dtype(self._space.dtype).kind in "iu"
+        self._acts_in_integers = takes_integers(self._space)
         self._kinds = "biu" if np.dtype(self._seen.dtype).kind in "biu" else "biuf"
         self.observation_dim = int(np.prod(self._seen.shape))
         self.action_dim = int(np.prod(self._space.shape))
@@ -132,7 +137,7 @@ class ForeignEnvironment:
         number, self._is_sound = self.elapsed + 1, False
         try:
             outcome = self._env.step(self._applied(action))
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             hint = _OLD_INTERFACE if "values to unpack" in str(error) else ""
             raise RuntimeError(f"{self._at(number)}: raised {type(error).__name__}: {error}{hint}") from error
         if not isinstance(outcome, tuple) or len(outcome) != 5:
@@ -176,8 +181,14 @@ class ForeignEnvironment:
             self._refuse_other(step[-1], self._row[end - 1], elapsed)
 
     def render(self) -> NDArray[np.uint8]:
-        """Return what it draws (height, width, 3). Raises TypeError if that is no picture."""
-        return checked(self._env.render())
+        """Return what it draws (height, width, 3).
+
+        Raises UnusableEnvironmentError if that is no picture, or if something to draw with is not installed.
+        """
+        try:
+            return checked(self._env.render())
+        except (TypeError, ImportError, gymnasium.error.DependencyNotInstalled) as error:
+            raise UnusableEnvironmentError(f"environment {self.env_id!r} cannot be filmed: {error}") from error
 
     def close(self) -> None:
         """Let go of what it holds; one that fails to do so is let go of anyway."""
@@ -198,7 +209,7 @@ class ForeignEnvironment:
         self._is_sound = False
         try:
             outcome = self._env.reset(seed=seed)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             hint = _OLD_INTERFACE if isinstance(error, TypeError) and "keyword argument" in str(error) else ""
             raise RuntimeError(f"{self._at(0)}: reset raised {type(error).__name__}: {error}{hint}") from error
         if not isinstance(outcome, tuple) or len(outcome) != 2 or not isinstance(outcome[1], dict):

@@ -101,7 +101,7 @@ class ReplayBatch:
                 environment.replay(history, elapsed)
 
     def render(self, simulator: int) -> NDArray[np.uint8]:
-        """Return what an environment draws (height, width, 3). Raises TypeError if that is no picture."""
+        """Return what an environment draws (height, width, 3). Raises UnusableEnvironmentError if it cannot."""
         return self._environments[simulator].render()
 
     def close(self) -> None:

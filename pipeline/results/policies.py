@@ -119,7 +119,8 @@ class LearningCurve:
 
 @dataclass(frozen=True)
 class Policy:
-    """A trained policy as it is used: it flattens observations, and scales and clips actions, as its training did."""
+    """A trained policy as it is used: it flattens observations, and scales, clips and, where only whole numbers are
+    taken, rounds actions, as its training did."""
 
     gaussian: GaussianPolicy
     """Its actions are in units of the action space (`action_units`)."""
@@ -130,6 +131,8 @@ class Policy:
     action_high: NDArray[np.float32]
     env_steps: int = 0
     """Environment steps of its training."""
+    acts_in_integers: bool = False
+    """Whether the action space holds whole numbers."""
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.float32]:
         """Return the mean action for one observation, or for a batch (B, ...) of them.
@@ -144,7 +147,8 @@ class Policy:
         actions = self.gaussian.mean(flat).reshape(-1, *self.action_low.shape)
         middle, half = action_units(self.action_low, self.action_high)
         clipped = np.clip(middle + half * actions, self.action_low, self.action_high)
-        return np.asarray(clipped[0] if single else clipped)
+        applied = np.rint(clipped) if self.acts_in_integers else clipped
+        return np.asarray(applied[0] if single else applied)
 
     def predict(
         self, observation: NDArray[Any], state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -159,7 +163,7 @@ class Policy:
 
     def files(self) -> Files:
         """Return the artifact's content; an infinite bound is null."""
-        described = {
+        described: dict[str, Any] = {
             "environment": self.environment_id,
             "activation": "tanh",
             "observation_shape": list(self.observation_shape),
@@ -167,6 +171,8 @@ class Policy:
             "action_high": self.action_high.tolist(),
             "env_steps": self.env_steps,
         }
+        if self.acts_in_integers:
+            described["acts_in_integers"] = True
         return {**policy_file(self.gaussian), _POLICY_META: encode_json(described)}
 
     @classmethod
@@ -180,6 +186,7 @@ class Policy:
             action_low=_bounds(described["action_low"], -np.inf),
             action_high=_bounds(described["action_high"], np.inf),
             env_steps=described["env_steps"],
+            acts_in_integers=described.get("acts_in_integers", False),
         )
 
 

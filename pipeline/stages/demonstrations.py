@@ -9,6 +9,7 @@ import numpy as np
 
 from oodil.pipeline.artifacts import Files, read_artifact
 from oodil.pipeline.config import DemonstrationsConfig, EnvironmentConfig, ExpertConfig, RunConfig
+from oodil.pipeline.config.sections import is_same
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.datasets import read_demonstrations, read_file
 from oodil.pipeline.environments import Simulators, environment_spec, make_batch
@@ -160,8 +161,7 @@ def check_demonstrations(config: RunConfig, observation_dim: int, run: Run | Non
                 f"{section.file}: states have {demonstrations.observation_dim} dimensions; "
                 f"environment {config.environment.id} has {observation_dim}"
             )
-        # The module that registers an environment is no part of its name.
-        if environment and environment.rpartition(":")[2] != config.environment.id.rpartition(":")[2]:
+        if environment and not is_same(environment, config.environment.id):
             raise DataError(f"{section.file}: recorded in {environment}, but the run is for {config.environment.id}")
         _check_labels(config, demonstrations)
     else:

@@ -119,6 +119,7 @@ class PolicyStage(Stage):
             observation_shape=spec.observation_shape,
             action_low=spec.action_low,
             action_high=spec.action_high,
+            acts_in_integers=spec.acts_in_integers,
             env_steps=gail.num_iterations * gail.steps_per_iteration,
         )
         mean, std, length = np.concatenate([*known, history.values("curve").ravel()]).reshape(-1, 3).T

@@ -9,6 +9,7 @@ import numpy as np
 from oodil.orchestrator import Observer, check_inputs, choose, execute, read_run
 from oodil.orchestrator import open_run as open_folder
 from oodil.pipeline.config import RunConfig
+from oodil.pipeline.config.sections import is_same
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.datasets.foreign import read_any
 from oodil.pipeline.errors import DataError
@@ -171,7 +172,7 @@ def read_later(
     """Return demonstrations that a run is to score. Raises DataError that names the source, and what does not fit."""
     demonstrations, environment = read_any(source, keys, ends_are_failures)
     check_dimension(results, demonstrations, source)
-    if environment and environment != results.config.environment.id:
+    if environment and not is_same(environment, results.config.environment.id):
         raise DataError(f"{source}: recorded in {environment}, but the run is for {results.config.environment.id}")
     return demonstrations
 

@@ -11,6 +11,7 @@ from oodil.experiments import Table
 from oodil.pipeline.artifacts import fingerprint
 from oodil.pipeline.config import EnvironmentConfig
 from oodil.pipeline.environments import make_batch
+from oodil.pipeline.errors import UnusableEnvironmentError
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.stage import Run, Stage, state_of
 
@@ -119,7 +120,17 @@ def table_cost(found: Sequence[Outlook], workers: int | None) -> RunCost:
 
 
 def step_seconds(environment: EnvironmentConfig, count: int = 8) -> float:
-    """Return how long a step of an environment takes on one core, by so many simulators under random actions."""
+    """Return how long a step of an environment takes on one core, by so many simulators under random actions.
+
+    Raises UnusableEnvironmentError for one that does not do what it should.
+    """
+    try:
+        return _measured(environment, count)
+    except (RuntimeError, FloatingPointError) as error:
+        raise UnusableEnvironmentError(str(error)) from error
+
+
+def _measured(environment: EnvironmentConfig, count: int) -> float:
     simulators = make_batch(environment.id, environment.dynamics, count)
     rng = np.random.default_rng(0)
     for index in range(count):

@@ -3,6 +3,7 @@
 import fcntl
 import json
 import shutil
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from typer.testing import CliRunner
 
 import oodil
 from oodil.cli import app
+from oodil.cli.doctor import EXTRAS
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.datasets import encode_demonstrations
 from oodil.pipeline.loading import load_config
@@ -201,6 +203,11 @@ def test_the_doctor_looks_at_everything(tmp_path: Path, monkeypatch: pytest.Monk
     assert found["disk"]["state"] == "attention" and str(tmp_path) in found["disk"]["found"]
     assert "--run-dir" in found["disk"]["advice"]
     assert found["GPU"]["state"] == "ok" and "not used" in found["GPU"]["found"]
+
+
+def test_the_doctor_knows_all_extras() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert EXTRAS.keys() == extras.keys() - {"docs", "test"}
 
 
 def test_the_doctor_goes_on_when_something_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:

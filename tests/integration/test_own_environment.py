@@ -10,8 +10,9 @@ import pytest
 import safetensors.numpy
 import yaml
 
+from oodil import api
 from oodil.pipeline.environments import make_batch
-from oodil.pipeline.errors import StorageError
+from oodil.pipeline.errors import StorageError, UnfinishedError
 from oodil.pipeline.loading import load_config
 from oodil.workers.channels import EndpointError
 from oodil.workers.local_engine import LocalEngine
@@ -74,6 +75,19 @@ def test_a_module_beside_the_configuration_is_found_in_every_process(folder: Pat
     assert code == 0 and "length 60" in output, output
 
 
+def test_a_conversion_finds_the_module_in_the_current_folder_or_beside_what_it_writes(folder: Path) -> None:
+    np.savez(folder / "mine.npz", *np.zeros((2, 9, 6)))
+    (folder / "elsewhere").mkdir()
+    for at, source, output in (
+        (folder, "mine.npz", "elsewhere/all.safetensors"),
+        (folder / "elsewhere", "../mine.npz", "../all.safetensors"),
+    ):
+        code, said = oodil("demos", "convert", source, "--environment", ENV_ID, "--output", output, cwd=at)
+        assert code == 0 and (at / output).is_file(), said
+    code, said = oodil("demos", "convert", "../mine.npz", "--environment", ENV_ID, cwd=folder / "elsewhere")
+    assert code == 2 and f"{MODULE} has to lie" in said and "in the current folder" in said
+
+
 def test_modules_of_general_names_on_the_path_do_no_harm(folder: Path) -> None:
     for name in ("workers", "pipeline", "terminal", "orchestrator", "configs", "cli", "api", "bench"):
         (folder / f"{name}.py").write_text("raise ImportError('not yours')")
@@ -85,7 +99,10 @@ def test_modules_of_general_names_on_the_path_do_no_harm(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["clustering.num_clusters=7"], "6 demonstrations cannot make 7 clusters; set clustering.num_clusters to 6"),
+        (
+            ["clustering.num_clusters=7"],
+            "6 demonstrations cannot form 7 clusters; give more, or a smaller clustering.num_clusters",
+        ),
         ([f"environment.id={MODULE}:odd/Broadcast-v0"], "observes an array of shape (2,), but its observation space"),
         ([f"environment.id={MODULE}:odd/LateDraw-v0"], "is not deterministic"),
         (["environment.dynamics.weight=3"], "does not take the dynamics {'weight': 3}"),
@@ -123,9 +140,16 @@ def test_a_disk_without_room_for_the_demonstrations_is_refused(folder: Path, mon
 
 def test_what_is_found_later_ends_the_run_at_once(folder: Path) -> None:
     """Carts that a policy drives get where the trial did not, and the first episode that is over is played again."""
-    far = ("environment.id=home_made:odd/Far-v0", "runtime.max_attempts=9", "transferability.gail.total_steps=40000")
-    for workers in ("0", "2"):
-        code, output = oodil("run", "mine.yaml", *far, "--workers", workers, "--run-dir", f"r{workers}", cwd=folder)
-        assert code == 1, output
-        assert "'home_made:odd/Far-v0' is not deterministic: an episode of 60 steps" in output.replace("\n", " ")
-        assert "Traceback" not in output, output
+    said = "'home_made:odd/Far-v0' is not deterministic: an episode of 60 steps"
+    far = ["environment.id=home_made:odd/Far-v0", "runtime.max_attempts=9", "transferability.gail.total_steps=40000"]
+    for workers in (0, 2):
+        with pytest.raises(UnfinishedError, match=said):
+            api.run(folder / "mine.yaml", far, workers=workers, run_dir=folder / f"r{workers}")
+
+
+def test_what_the_estimate_meets_is_one_message(folder: Path) -> None:
+    """It plays more episodes than the trial; there the environment fails."""
+    for name, message in (("Tired", "raised OSError: no more"), ("Blinded", "observation that is not finite")):
+        environment, run_dir = f"environment.id={MODULE}:odd/{name}-v0", ("--run-dir", name)
+        code, output = oodil("run", "mine.yaml", environment, "--workers", "0", *run_dir, cwd=folder)
+        assert code == 2 and message in output and "Traceback" not in output, output

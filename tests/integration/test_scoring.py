@@ -132,6 +132,13 @@ def test_demonstrations_that_do_not_fit(
     assert not (tmp_path / "out.csv").exists()
 
 
+def test_the_module_that_registers_an_environment_is_no_part_of_its_name(
+    results: oodil.RunResults, tmp_path: Path
+) -> None:
+    (tmp_path / "later.safetensors").write_bytes(states(environment=f"oodil:{HOPPER}"))
+    assert len(oodil.score(results, tmp_path / "later.safetensors").demonstrations) == 1
+
+
 def test_what_cannot_be_asked(results: oodil.RunResults, file: Path, tmp_path: Path) -> None:
     assert "no such file" in refused(results.path, tmp_path / "nowhere.npz")
     assert "is not a run" in refused(tmp_path, file)

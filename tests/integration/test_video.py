@@ -98,9 +98,18 @@ def test_what_cannot_be_written_or_drawn_is_refused(tmp_path: Path) -> None:
         film(Loud(), STRICT, {}, KEY, tmp_path / "film.mp4")
     with pytest.raises(StorageError, match=r"missing/film\.mp4: No such file"):
         film(Loud(), STRICT, {}, KEY, tmp_path / "missing" / "film.mp4")
-    with pytest.raises(UnusableEnvironmentError, match="gave NoneType"):
+    with pytest.raises(
+        UnusableEnvironmentError, match=r"Blind-v0' cannot be filmed: render\(\) gave NoneType; .*bytes$"
+    ):
         film(Loud(), STRICT.replace("Table", "Blind"), {}, KEY, tmp_path / "blind.mp4")
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+
+
+def test_what_is_not_installed_is_named_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "highway_env.road.graphics", None)
+    with pytest.raises(UnusableEnvironmentError, match=r"not installed; pip install 'oodil\[driving\]'$"):
+        film(Loud(), "oodil/Driving-v0", {}, KEY, tmp_path / "film.mp4")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_film_that_cannot_be_written_ends_with_exit_code_2(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from oodil.pipeline.config import EnvironmentConfig
 from oodil.pipeline.environments import check_environment, environment_spec, make_batch
 from oodil.pipeline.errors import UnusableEnvironmentError
 from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.records import random_return
 from oodil.pipeline.results import Policy
 
 ODD = "tests.odd_environments:odd/{}-v0"
@@ -54,6 +55,32 @@ def test_a_policy_acts_in_the_numbers_of_the_environment() -> None:
     assert policy.act(np.zeros(6)).tolist() == [-100.0, 2.0, -7.0]
     ours = replace(policy, action_low=-np.ones(3, np.float32), action_high=np.ones(3, np.float32))
     assert ours.act(np.zeros(6)).tolist() == [0.25, -1.0, -1.0]
+
+
+def test_a_policy_gives_whole_numbers_where_the_environment_takes_no_others() -> None:
+    """What it gives is what its training applied: 2.5 -> 2, -1.45 -> -1, and no further than 5."""
+    in_units = [0.5, -0.29, 2.0]
+    spec = environment_spec(ODD.format("Gears"), {})
+    gaussian = GaussianPolicy(
+        weights=(np.zeros((6, 3), np.float32),),
+        biases=(np.array(in_units, np.float32),),
+        log_std=np.zeros(3, np.float32),
+        input_mean=np.zeros(6, np.float32),
+        input_scale=np.ones(6, np.float32),
+    )
+    policy = Policy(gaussian, "", (6,), spec.action_low, spec.action_high, acts_in_integers=spec.acts_in_integers)
+    assert policy.act(np.zeros(6)).tolist() == given("Gears", in_units).tolist() == [2, -1, 5]
+    assert not environment_spec(ODD.format("Newtons"), {}).acts_in_integers
+
+
+def test_random_actions_reach_as_far_in_newtons() -> None:
+    carts, strong = (random_return(EnvironmentConfig(id=ODD.format(name))) for name in ("Carts", "Strong"))
+    assert strong == pytest.approx(carts, rel=1e-5)
+
+
+def test_an_environment_that_ends_the_process_is_refused() -> None:
+    with pytest.raises(UnusableEnvironmentError, match=r"step 3 of an episode: raised SystemExit: the simulator left"):
+        check_environment(ODD.format("Leaves"), {})
 
 
 @pytest.mark.parametrize(

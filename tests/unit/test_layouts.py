@@ -76,6 +76,20 @@ def test_columns_by_their_names(tmp_path: Path, columns: dict[str, Any]) -> None
         assert_each(read(npz(tmp_path, **columns))[0])
 
 
+def test_one_array_or_dictionary_alone_holds_all_demonstrations(tmp_path: Path) -> None:
+    equal = [states[:2] for states in EACH]
+    for alone, each in (
+        (np.stack(equal), equal),
+        (objects(EACH), EACH),
+        (objects([{"obs": states, "act": states[:, :2]} for states in EACH]), EACH),
+        (np.array({"observations": EACH}, dtype=object), EACH),
+    ):
+        np.savez(tmp_path / "alone.npz", alone)
+        assert_each(read(tmp_path / "alone.npz")[0], each)
+        assert_each(read(npz(tmp_path, trajectories=alone))[0], each)
+    assert_each(read(npz(tmp_path, demo_0=EACH[0].reshape(len(EACH[0]), -1, 1)))[0], EACH[:1])
+
+
 def test_actions_of_the_same_width_are_no_demonstration(tmp_path: Path) -> None:
     for name in ("actions", "acts", "velocities"):
         found, said = read(npz(tmp_path, observations=STATES, **{name: OTHER}))
@@ -88,7 +102,7 @@ def test_actions_of_the_same_width_are_no_demonstration(tmp_path: Path) -> None:
 def test_next_states_say_where_a_demonstration_ends(tmp_path: Path) -> None:
     before = np.concatenate([states[:-1] for states in EACH])
     after = np.concatenate([states[1:] for states in EACH])
-    for names in (("observations", "next_observations"), ("obs", "next_obs")):
+    for names in (("observations", "next_observations"), ("obs", "next_obs"), ("obs", "next_observations")):
         found, said = read(npz(tmp_path, **dict(zip(names, (before, after), strict=True)), actions=before))
         assert_each(found)
         assert "2 of them are not in the next row" in said[0]

@@ -62,6 +62,15 @@ def test_one_observation_alone_and_a_policy_without_limits(policy: Policy, tmp_p
     np.testing.assert_allclose(action[0], unlimited.act(seen[0]), rtol=0, atol=2e-6)
 
 
+def test_whole_actions_are_rounded(policy: Policy, tmp_path: Path) -> None:
+    bounds = np.full(4, 9, np.float32)
+    whole = replace(policy, action_low=-bounds, action_high=bounds, acts_in_integers=True)
+    seen = observations(policy.observation_shape)
+    (action,) = session(whole, tmp_path / "policy.onnx").run(None, {"observation": seen})
+    assert set(np.unique(action)) == set(range(-9, 10))
+    assert (action == whole.act(seen)).mean() > 0.999, "the networks' outputs differ in their last bits"
+
+
 def test_the_file_says_where_it_comes_from(policy: Policy, tmp_path: Path) -> None:
     loaded = session(policy, tmp_path / "policy.onnx")
     assert loaded.get_modelmeta().custom_metadata_map == {"environment": "Some-v0", "env_steps": "7"}

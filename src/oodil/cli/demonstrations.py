@@ -93,9 +93,12 @@ def convert_demos(
     from oodil.pipeline.datasets import encode_demonstrations
     from oodil.pipeline.datasets.foreign import check_output, labels_of, read_foreign
     from oodil.pipeline.environments import environment_spec
-    from oodil.pipeline.loading import apply_override
+    from oodil.pipeline.loading import apply_override, find_modules_in
 
     check_output(output, sources)
+    if ":" in environment:
+        for folder in (Path.cwd(), output.absolute().parent):  # The configuration will lie in one of them.
+            find_modules_in(str(folder))
     arguments: dict[str, Any] = {}
     for each in dynamics or ():
         apply_override(arguments, each)
