@@ -151,5 +151,5 @@ def test_a_plan_computes_nothing(tmp_path: Path) -> None:
     write_experiment(tmp_path)
     output = run(*command(tmp_path, 1, "--plan", "--rows", "all"))
     assert "2 runs: 12 stages to compute, 0 to take over, 0 finished" in output
-    assert "hours with 1 runs at once on this machine" in output
+    assert "with 1 runs at once; by a short measurement" in output
     assert [path.name for path in tmp_path.iterdir()] == ["experiment.yaml"]
