@@ -112,7 +112,8 @@ class Table:
         write_file(results, encode_json(found, sort_keys=False))
         seconds = {run.name: sum(RunResults(self.opened(run)).seconds().values()) for run in self.runs}
         circumstances = {
-            "command": ["oodil", *command],
+            # Nobody else has these folders.
+            "command": ["oodil", *(Path(each).name if Path(each).is_absolute() else each for each in command)],
             "machine": machine(),
             "raw_hopper_steps_per_s": raw_rate(),
             "versions": library_versions(),
