@@ -13,6 +13,7 @@ import pytest
 import oodil.pipeline.collecting
 from oodil.pipeline.collecting import InlineRollouts, collect
 from oodil.pipeline.data import Unit, UnitResult
+from oodil.pipeline.errors import UnusableEnvironmentError
 from oodil.pipeline.stage import JobStoppedError
 from oodil.pipeline.versions import collecting_versions
 from oodil.workers import rollout_worker, zmq_rollouts
@@ -279,8 +280,20 @@ def test_a_unit_that_fails_once_is_given_to_another_worker(
 def test_a_unit_that_always_fails_raises_with_the_workers_traceback(source: ZmqRollouts, endpoint: str) -> None:
     workers = Threads(endpoint, 2)
     try:
+        # A policy that sees fewer dimensions than the environment has.
+        units = hopper_units(0, count=2, env_id="oodil/Walker2d-v0")
+        source.submit([replace(unit, dynamics=()) for unit in units])
+        with pytest.raises(CollectError, match=r"(?s)failed 3 times.*Traceback.*Error"):
+            source.gather()
+    finally:
+        workers.close()
+
+
+def test_a_unit_whose_environment_cannot_be_is_not_tried_again(source: ZmqRollouts, endpoint: str) -> None:
+    workers = Threads(endpoint, 2)
+    try:
         source.submit(hopper_units(0, count=2, env_id="oodil/Unicorn-v0"))
-        with pytest.raises(CollectError, match=r"(?s)Traceback.*oodil/Unicorn-v0"):
+        with pytest.raises(UnusableEnvironmentError, match="oodil/Unicorn-v0"):
             source.gather()
     finally:
         workers.close()
