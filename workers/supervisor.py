@@ -136,14 +136,16 @@ class Supervisor:
     def close(self, grace_s: float) -> None:
         """End all children: ask, wait, terminate, kill. Bounded, and harmless when repeated."""
         processes = [running for _, running in self._running()]
-        for running in processes:
-            running.say(Stop())
-        _join(processes, grace_s)
-        for running in processes:
-            running.process.signal(signal.SIGTERM)
-        _join(processes, _TERMINATE_S)
-        for running in processes:
-            running.process.signal(signal.SIGKILL)
+        try:
+            for running in processes:
+                running.say(Stop())
+            _join(processes, grace_s)
+            for running in processes:
+                running.process.signal(signal.SIGTERM)
+            _join(processes, _TERMINATE_S)
+        finally:  # Another Ctrl-C may come meanwhile; none of them may outlive it.
+            for running in processes:
+                running.process.signal(signal.SIGKILL)
         _join(processes, _KILL_S)
         for running in processes:
             running.process.close()
