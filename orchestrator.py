@@ -27,8 +27,6 @@ from oodil.pipeline.locks import held
 from oodil.pipeline.metrics import check_logger
 from oodil.pipeline.stage import Run, Stage, state_of
 from oodil.pipeline.stages import stages
-from oodil.pipeline.stages.demonstrations import check_demonstrations
-from oodil.pipeline.stages.oracle_target import TargetDemonstrationsStage, check_target
 from oodil.pipeline.versions import library_versions
 from oodil.workers.engine import Engine, Outcome
 from oodil.workers.reports import Event
@@ -123,9 +121,8 @@ def check_inputs(config: RunConfig, run: Run | None = None) -> None:
     spec = check_environment(config.environment.id, config.environment.dynamics)
     for source in config.demonstrations.sources:
         check_environment(config.environment.id, source.dynamics)
-    check_demonstrations(config, spec.observation_dim, run)
-    if TargetDemonstrationsStage.name in [stage.name for stage in stages(config)]:
-        check_target(config, spec.observation_dim)
+    for stage in stages(config):
+        stage.check_files(config, spec.observation_dim, run)
     check_logger(config.runtime.logger)
 
 

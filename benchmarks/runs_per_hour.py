@@ -13,8 +13,8 @@ from typing import Any
 import yaml
 from common import OODIL, arguments_of, circumstances, save
 
-from oodil.bench import raw_rate
-from oodil.estimate import outlook, table_cost, usable_cores
+from oodil.bench import raw_rate, usable_cores
+from oodil.estimate import outlook, table_cost
 from oodil.experiments import Table
 from oodil.pipeline.experiment import load_experiment
 

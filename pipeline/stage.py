@@ -108,6 +108,14 @@ class Stage(ABC):
     def check(self, config: RunConfig) -> None:  # noqa: B027 (most stages can always run)
         """Raise ConfigError, before any work, for a configuration in which this stage cannot run."""
 
+    def check_files(  # noqa: B027 (most stages read nothing but other stages)
+        self, config: RunConfig, observation_dim: int, run: Run | None = None
+    ) -> None:
+        """Raise DataError or ExpertError, before any work, for files that do not fit the imitator's environment.
+
+        What a ``run`` has taken over from files is not looked for any more.
+        """
+
     @abstractmethod
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return everything in the configuration that changes the result, and nothing else, as JSON values.

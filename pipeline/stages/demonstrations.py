@@ -35,6 +35,33 @@ class DemonstrationsStage(Stage):
     version = 3
     inputs = ()
 
+    def check_files(self, config: RunConfig, observation_dim: int, run: Run | None = None) -> None:
+        """Raise DataError or ExpertError, before any work, if the demonstrations cannot fit the environment.
+
+        A ``run`` that has taken them over needs neither their file nor their experts any more.
+        """
+        section = config.demonstrations
+        if run is not None and state_of(self, run).state == "done":
+            _check_count(config, len(load_demonstrations(run)), run.directory.path)
+            return
+        if section.file is not None:
+            demonstrations, environment = read_demonstrations(section.file)
+            _check_count(config, len(demonstrations), section.file)
+            if demonstrations.observation_dim != observation_dim:
+                raise DataError(
+                    f"{section.file}: states have {demonstrations.observation_dim} dimensions; "
+                    f"environment {config.environment.id} has {observation_dim}"
+                )
+            if environment and not is_same(environment, config.environment.id):
+                raise DataError(
+                    f"{section.file}: recorded in {environment}, but the run is for {config.environment.id}"
+                )
+            _check_labels(config, demonstrations)
+        else:
+            _check_count(config, sum(source.count for source in section.sources), "demonstrations.sources")
+        for source in section.sources:
+            check_expert(source, EnvironmentConfig(id=config.environment.id, dynamics=source.dynamics), observation_dim)
+
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the sources with the content of their experts, or the content of the file."""
         section = config.demonstrations
@@ -142,32 +169,6 @@ def transferable_marks(config: RunConfig, labels: tuple[str, ...]) -> list[bool 
         known |= zip(before, transferable_marks(base.config, before), strict=True)
     known |= dict.fromkeys(section.transferable, True) | dict.fromkeys(section.unmarked)
     return [known.get(label, False if section.transferable else None) for label in labels]
-
-
-def check_demonstrations(config: RunConfig, observation_dim: int, run: Run | None = None) -> None:
-    """Raise DataError or ExpertError, before any work, if the demonstrations cannot fit the environment.
-
-    A ``run`` that has taken them over needs neither their file nor their experts any more.
-    """
-    section = config.demonstrations
-    if run is not None and state_of(DemonstrationsStage(), run).state == "done":
-        _check_count(config, len(load_demonstrations(run)), run.directory.path)
-        return
-    if section.file is not None:
-        demonstrations, environment = read_demonstrations(section.file)
-        _check_count(config, len(demonstrations), section.file)
-        if demonstrations.observation_dim != observation_dim:
-            raise DataError(
-                f"{section.file}: states have {demonstrations.observation_dim} dimensions; "
-                f"environment {config.environment.id} has {observation_dim}"
-            )
-        if environment and not is_same(environment, config.environment.id):
-            raise DataError(f"{section.file}: recorded in {environment}, but the run is for {config.environment.id}")
-        _check_labels(config, demonstrations)
-    else:
-        _check_count(config, sum(source.count for source in section.sources), "demonstrations.sources")
-    for source in section.sources:
-        check_expert(source, EnvironmentConfig(id=config.environment.id, dynamics=source.dynamics), observation_dim)
 
 
 def check_expert(section: ExpertConfig, environment: EnvironmentConfig, observation_dim: int) -> None:

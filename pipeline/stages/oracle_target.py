@@ -29,11 +29,24 @@ class TargetDemonstrationsStage(Stage):
         """Raise ConfigError unless an expert is named."""
         _section(config)
 
+    def check_files(self, config: RunConfig, observation_dim: int, run: Run | None = None) -> None:
+        """Raise DataError or ExpertError, before any work, unless the expert acts in the imitator's own dynamics."""
+        section, environment = _section(config), config.environment
+        check_expert(section, environment, observation_dim)
+        if section.expert_folder is None:
+            return
+        trained = load_expert(section.expert_folder)[1].json("expert.json").get("environment", {}).get("dynamics")
+        if trained is not None and trained != environment.dynamics:
+            raise ExpertError(
+                f"oracle_target.expert: {section.expert} was trained with {_words(trained)}; "
+                f"the imitator has {_words(environment.dynamics)}"
+            )
+
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the imitator's environment, the content of the expert, and what is collected."""
         section = _section(config)
         chosen = {"count": section.count, "expert_sha256": identity(section)}
-        return {"environment": config.environment.model_dump()} | chosen | flags(config.demonstrations)
+        return {"environment": config.environment.settings()} | chosen | flags(config.demonstrations)
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Collect in the imitator's environment."""
@@ -60,20 +73,6 @@ class TargetOracle(PolicyStage):
     def demonstrations(self, run: Run) -> Demonstrations:
         """Return those of the imitator's own dynamics."""
         return CollectedDemonstrations.load(run.artifact(TargetDemonstrationsStage.name)).demonstrations
-
-
-def check_target(config: RunConfig, observation_dim: int) -> None:
-    """Raise DataError or ExpertError, before any work, unless the expert acts in the imitator's own dynamics."""
-    section, environment = _section(config), config.environment
-    check_expert(section, environment, observation_dim)
-    if section.expert_folder is None:
-        return
-    trained = load_expert(section.expert_folder)[1].json("expert.json").get("environment", {}).get("dynamics")
-    if trained is not None and trained != environment.dynamics:
-        raise ExpertError(
-            f"oracle_target.expert: {section.expert} was trained with {_words(trained)}; "
-            f"the imitator has {_words(environment.dynamics)}"
-        )
 
 
 def _section(config: RunConfig) -> ExpertConfig:

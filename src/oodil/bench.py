@@ -38,9 +38,14 @@ def compare(
     return results
 
 
+def usable_cores() -> int:
+    """Return the cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def worker_counts() -> list[int]:
     """Return the numbers of workers worth trying here: none, and powers of two up to the number of cores."""
-    cores = os.cpu_count() or 1
+    cores = usable_cores()
     return [0, *(2**i for i in range(cores.bit_length()) if 2**i <= cores)]
 
 

@@ -1,12 +1,12 @@
 """What a run will cost: environment steps, which follow from its configuration, and time, from a short measurement."""
 
-import os
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from oodil.bench import usable_cores
 from oodil.experiments import Table
 from oodil.pipeline.artifacts import fingerprint
 from oodil.pipeline.config import EnvironmentConfig
@@ -142,11 +142,6 @@ def _measured(environment: EnvironmentConfig, count: int) -> float:
         for index in np.flatnonzero(outcome.terminated | outcome.truncated).tolist():
             simulators.reset(index, seed=steps + index)
     return (time.perf_counter() - started) / steps
-
-
-def usable_cores() -> int:
-    """Return the cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _counted(steps: int) -> str:

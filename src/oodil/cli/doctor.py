@@ -88,7 +88,7 @@ def _versions() -> Iterator[Finding]:
 def _threads() -> Iterator[Finding]:
     import torch
 
-    from oodil.estimate import usable_cores
+    from oodil.bench import usable_cores
 
     cores, load = usable_cores(), os.getloadavg()[0]
     busy = f"other programs compute here ({load:.1f} at a time): runs take longer than announced"

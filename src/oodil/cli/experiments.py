@@ -32,7 +32,7 @@ def table(
     folder: Annotated[Path, typer.Option(help="Where the experiment has its folder.")] = Path("tables"),
 ) -> None:
     """Make a table of an experiment; what is finished is reused, what was interrupted goes on."""
-    from oodil.estimate import usable_cores
+    from oodil.bench import usable_cores
     from oodil.experiments import Table
     from oodil.pipeline.experiment import load_experiment
     from oodil.pipeline.report.table import write_table
