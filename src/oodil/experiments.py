@@ -73,6 +73,15 @@ class Table:
         by_length = sorted(found, key=lambda name: -sum(each.cost(configs[name], 0.0).core_s for each in found[name]))
         return {name: found[name] for name in by_length if found[name]}
 
+    def unfinished(self, selected: dict[str, list[Stage]]) -> dict[str, list[Stage]]:
+        """Return those of the selected runs of which a selected stage is not there yet."""
+        results = {run.name: RunResults(self.opened(run)) for run in self.runs if run.name in selected}
+        return {
+            name: stages
+            for name, stages in selected.items()
+            if not all(results[name].is_done(stage.name) for stage in stages)
+        }
+
     def compute(
         self,
         selected: dict[str, list[Stage]],

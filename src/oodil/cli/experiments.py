@@ -36,6 +36,7 @@ def table(
     from oodil.experiments import Table
     from oodil.pipeline.experiment import load_experiment
     from oodil.pipeline.report.table import write_table
+    from oodil.workers.engine import Outcome
 
     experiment = load_experiment(source)
     if seeds is not None:
@@ -48,11 +49,12 @@ def table(
     count = usable_cores() if workers is None and engine == "local" else workers
     where = engine_of(made.runs[0].config, engine, count, trust_cluster=trust_cluster)
     command = shlex.join(["oodil", *sys.argv[1:]])
-    outcome = _compute(made, selected, where, command)
+    left = made.unfinished(selected)
+    outcome = _compute(made, left, where, command) if left else Outcome()
     made.write_results(outcome.failed, sys.argv[1:])
     print(write_table(made.folder))
     if outcome.failed or outcome.stopped:
-        raise UnfinishedError(_unfinished(outcome, command), made.experiment.name, outcome.failed)
+        raise UnfinishedError(_unfinished(outcome, len(selected), command), made.experiment.name, outcome.failed)
 
 
 def _compute(made: "Table", selected: "dict[str, list[Stage]]", engine: "Engine", command: str) -> "Outcome":
@@ -71,12 +73,12 @@ def _compute(made: "Table", selected: "dict[str, list[Stage]]", engine: "Engine"
         return made.compute(selected, engine, on_event, should_stop)
 
 
-def _unfinished(outcome: "Outcome", command: str) -> str:
+def _unfinished(outcome: "Outcome", runs: int, command: str) -> str:
     failures = "".join(f"{run} failed:\n{reason.rstrip()}\n\n" for run, reason in sorted(outcome.failed.items()))
     named = f" ({', '.join(sorted(outcome.failed))})" if outcome.failed else ""
     return (
-        f"{failures}{len(outcome.done)} runs done, {len(outcome.failed)} failed{named}, {len(outcome.not_run)} not "
-        f"finished. What is finished is kept; go on with: {command}"
+        f"{failures}{runs - len(outcome.failed) - len(outcome.not_run)} runs done, {len(outcome.failed)} failed{named}, "
+        f"{len(outcome.not_run)} not finished. What is finished is kept; go on with: {command}"
     )
 
 
