@@ -20,6 +20,7 @@ from oodil.pipeline.errors import ConfigError, StorageError, UnfinishedError
 from oodil.pipeline.experiment import ExperimentConfig, PlannedRun, plan
 from oodil.pipeline.locks import held
 from oodil.pipeline.records import records
+from oodil.pipeline.report.table.records import MADE, RESULTS
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.stage import JobContext, JobStoppedError, Run, Stage, register
 from oodil.pipeline.stages import stages as stages_of
@@ -114,11 +115,15 @@ class Table:
             write_file(self.runner.config, (whole.config.model_dump_json(indent=2) + "\n").encode())
             return engine.run_jobs(WholeRuns(), whole, list(selected), on_event, should_stop)
 
-    def write_results(self, failed: Mapping[str, str], command: Sequence[str]) -> Path:
-        """Write what is known by now, and beside it how it was made; return the file of the former."""
-        results, made = self.folder / "results.json", self.folder / "made.json"
+    def write_results(self, failed: Mapping[str, str]) -> Path:
+        """Write what is known by now; return the file."""
         found = records(self.experiment, self.runs, self.folder, failed)
-        write_file(results, encode_json(found, sort_keys=False))
+        path = self.folder / RESULTS
+        write_file(path, encode_json(found, sort_keys=False))
+        return path
+
+    def write_made(self, command: Sequence[str]) -> Path:
+        """Write how it was made: by which command, on what machine, how fast; return the file."""
         seconds = {run.name: sum(RunResults(self.opened(run)).seconds().values()) for run in self.runs}
         circumstances = {
             # Nobody else has these folders.
@@ -128,8 +133,9 @@ class Table:
             "versions": library_versions(),
             "seconds": {name: round(spent, 1) for name, spent in seconds.items() if spent},
         }
-        write_file(made, encode_json(circumstances))
-        return results
+        path = self.folder / MADE
+        write_file(path, encode_json(circumstances))
+        return path
 
 
 def _refuse_other_settings(run: Run) -> None:

@@ -175,7 +175,7 @@ def test_a_node_dies_in_the_middle_of_a_table(tmp_path: Path, cluster: Cluster) 
     killer.join()
     assert len(outcome.done) == 4
     wait_until(lambda: len([node for node in ray.nodes() if node["Alive"]]) == 1, timeout_s=120)
-    inline, on_ray = (table.write_results({}, []).read_bytes() for table in tables.values())
+    inline, on_ray = (table.write_results({}).read_bytes() for table in tables.values())
     assert inline == on_ray
 
 

@@ -36,6 +36,7 @@ def table(
     from oodil.experiments import Table
     from oodil.pipeline.experiment import load_experiment
     from oodil.pipeline.report.table import write_table
+    from oodil.pipeline.report.table.records import MADE
     from oodil.workers.engine import Outcome
 
     experiment = load_experiment(source)
@@ -51,7 +52,9 @@ def table(
     command = shlex.join(["oodil", *sys.argv[1:]])
     left = made.unfinished(selected)
     outcome = _compute(made, left, where, command) if left else Outcome()
-    made.write_results(outcome.failed, sys.argv[1:])
+    made.write_results(outcome.failed)
+    if left or not (made.folder / MADE).exists():
+        made.write_made(sys.argv[1:])
     print(write_table(made.folder))
     if outcome.failed or outcome.stopped:
         raise UnfinishedError(_unfinished(outcome, len(selected), command), made.experiment.name, outcome.failed)
@@ -76,8 +79,9 @@ def _compute(made: "Table", selected: "dict[str, list[Stage]]", engine: "Engine"
 def _unfinished(outcome: "Outcome", runs: int, command: str) -> str:
     failures = "".join(f"{run} failed:\n{reason.rstrip()}\n\n" for run, reason in sorted(outcome.failed.items()))
     named = f" ({', '.join(sorted(outcome.failed))})" if outcome.failed else ""
+    done = runs - len(outcome.failed) - len(outcome.not_run)
     return (
-        f"{failures}{runs - len(outcome.failed) - len(outcome.not_run)} runs done, {len(outcome.failed)} failed{named}, "
+        f"{failures}{done} runs done, {len(outcome.failed)} failed{named}, "
         f"{len(outcome.not_run)} not finished. What is finished is kept; go on with: {command}"
     )
 
