@@ -104,7 +104,8 @@ def main() -> None:
         scored = oodil.score(run, part, "transferability").found["transferability"]
         verdicts = scored.verdicts.tolist()
         told = {verdict: verdicts.count(verdict) for verdict in sorted(set(verdicts))}
-        found["fresh"][label] = {"scores": scored.scores.round(4).tolist(), "verdicts": told}
+        given = [None if np.isnan(score) else round(float(score), 4) for score in scored.scores]
+        found["fresh"][label] = {"scores": given, "verdicts": told}
         print(f"fresh, {label}: {np.round(scored.scores, 3).tolist()}, {told}", flush=True)
     save(arguments.json, found)
 

@@ -3,11 +3,13 @@
 For every seed: the true return of mean and of sampled actions along the training, environment steps until mean actions
 first reach the task's target, and the share of final episodes that reach it. Constants are chosen with ``--dynamics
 choosing``, imitators that no table uses, and reported with ``--dynamics reported``. ``--set KEY=VALUE`` changes a field
-of the training, such as ``discriminator.gradient_penalty=0`` or ``policy_optimizer.kind=ppo``.
+of the training, such as ``discriminator.gradient_penalty=0`` or ``policy_optimizer.kind=ppo``. What the file has of the
+same question is not trained again.
 
 Run ``python benchmarks/gail_reference.py hopper walker2d --seeds 10-14 --dynamics reported --json FILE``.
 """
 
+import json
 import multiprocessing
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -132,6 +134,9 @@ def run_seed(name: str, dynamics: str, seed: int, config: GailConfig, keep: Path
     return {
         "task": name,
         "seed": seed,
+        "demonstrator": task.demonstrator,
+        "imitator": target,
+        "target": task.target,
         "demonstrations_return": float(demonstrations.returns.mean()),
         "steps_to_target": int(steps[reached[0]]) if reached.size else None,
         "final_return": final.mean_return,
@@ -141,6 +146,15 @@ def run_seed(name: str, dynamics: str, seed: int, config: GailConfig, keep: Path
         "curve": {"env_steps": steps.tolist(), "mean": curve[:, 0].round(1).tolist(),
                   "sampled": curve[:, 1].round(1).tolist(), "std": curve[:, 2].round(3).tolist()},
     }  # fmt: skip
+
+
+def finished(path: Path | None, asked: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the results of the same question that a file has from an interrupted call."""
+    if path is None or not path.exists():
+        return []
+    found: dict[str, Any] = json.loads(path.read_text())
+    same = all(found[key] == asked[key] for key in ("dynamics", "set"))
+    return found["seeds"] if same else []
 
 
 def main() -> None:
@@ -154,14 +168,16 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="write the trained policies to this folder")
     arguments = parser.parse_args()
     found = circumstances() | {"dynamics": arguments.dynamics, "set": arguments.set}
+    results = finished(arguments.json, found)
+    known = {(result["task"], result["seed"]) for result in results}
     jobs = []
     for name in arguments.tasks or TASKS:
         values: dict[str, Any] = {"total_steps": TASKS[name].total_steps}
         for each in arguments.set:
             apply_override(values, each)
         config = GailConfig.model_validate(values)
-        jobs += [(name, arguments.dynamics, seed, config, arguments.keep) for seed in arguments.seeds]
-    results = []
+        left = [seed for seed in arguments.seeds if (name, seed) not in known]
+        jobs += [(name, arguments.dynamics, seed, config, arguments.keep) for seed in left]
     with ProcessPoolExecutor(arguments.processes, mp_context=multiprocessing.get_context("spawn")) as pool:
         for future in [pool.submit(run_seed, *job) for job in jobs]:
             results.append(future.result())

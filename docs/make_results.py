@@ -10,6 +10,8 @@ import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import fmean, median
+from typing import Any
 
 from oodil.pipeline.report import formats
 from oodil.pipeline.report.table import Table, read_table
@@ -50,7 +52,7 @@ def page(folder: Path = EXPERIMENTS) -> str:
         notes = folder / name / "notes.md"
         reasons = f"### Why\n\n{notes.read_text(encoding='utf-8').strip()}" if notes.is_file() else ""
         parts.append(markdown(table, level=2, below="\n\n".join(part for part in (pictures, reasons) if part)).strip())
-    parts.append(speed())
+    parts += [alone(), controls(), choice(), speed()]
     return "\n\n".join(parts) + "\n"
 
 
@@ -124,6 +126,85 @@ def cell(table: Table, entry: Entry, best: float) -> str:
 def anchor(table: Table) -> str:
     """Return where an experiment stands on the page."""
     return table.records.experiment.lower().replace(".", "")
+
+
+def alone() -> str:
+    """Return what GAIL makes of one reproducible source in every environment."""
+    file = "gail_reference_reported.json"
+    measured = json.loads((MEASURED / file).read_text())
+    rows = []
+    for task in dict.fromkeys(seed["task"] for seed in measured["seeds"]):
+        seeds = [seed for seed in measured["seeds"] if seed["task"] == task]
+        reached = [seed["steps_to_target"] or float("inf") for seed in seeds]
+        steps = ", ".join("never" if each == float("inf") else f"{each / 1000:,.0f} k" for each in reached)
+        returns = [seed["final_return"] for seed in seeds]
+        rows.append((
+            f"{task}, {_dynamics(seeds[0]['demonstrator'])} → {_dynamics(seeds[0]['imitator'])}",
+            f"{seeds[0]['seed']} to {seeds[-1]['seed']}",
+            f"{seeds[0]['target']:,.0f}",
+            f"{'never' if median(reached) == float('inf') else f'{median(reached) / 1000:,.0f} k'} ({steps})",
+            f"{seeds[0]['curve']['env_steps'][-1] / 1e6:.1f} M",
+            f"{fmean(returns):,.0f} ({', '.join(f'{each:,.0f}' for each in returns)})",
+            ", ".join(formats.percent(seed["final_share"]) for seed in seeds),
+        ))  # fmt: skip
+    head = ("environment", "seeds", "target", "steps to it: median", "training", "final return: mean", "episodes above")
+    return f"""## One source alone
+
+GAIL with the one setting, on demonstrations of one source that the imitator can reproduce; the last column is the
+share of 100 final episodes of each seed that are above the target. {_made(file, measured)}
+
+{lines(head, rows, escape=False)}"""
+
+
+def controls() -> str:
+    """Return the scores of demonstrations of which the answer is known before."""
+    measured = json.loads((MEASURED / "controls.json").read_text())
+    rows = [
+        (f"in the run: {label}", f"{min(each['scores']):.3f} to {max(each['scores']):.3f}",
+         f"{each['kept']} of {len(each['scores'])} kept")
+        for label, each in measured["sources"].items()
+    ]  # fmt: skip
+    for label, each in measured["fresh"].items():
+        scores = [score for score in each["scores"] if score is not None]
+        told = ", ".join(f"{count} {verdict}" for verdict, count in each["verdicts"].items())
+        rows.append((label, f"{min(scores):.3f} to {max(scores):.3f}" if scores else formats.UNKNOWN, told))
+    return f"""## Controls of the score
+
+An imitator under gravity 12, seed {measured["seed"]}: sources of one run, and below them fresh demonstrations that
+its frozen models score. Whatever is changed is of gravity 9.8; reversed ones are played backwards.
+{_made("controls.json", measured)}
+
+{lines(("demonstrations", "scores", "verdicts"), rows, escape=False)}"""
+
+
+def choice() -> str:
+    """Return whether the distance to the demonstrations chooses well among trainings."""
+    measured = json.loads((MEASURED / "selection.json").read_text())
+    rows = [
+        (f"{experiment}, {method}", str(each["policies"]), f"{each['rank_correlation']:.2f}",
+         *(f"{each[key]:,.0f}" for key in ("mean_return", "kept", "best")),
+         f"{each['kept_is_best']} of {len(each['runs'])}")
+        for experiment, methods in measured["experiments"].items()
+        for method, each in methods.items()
+    ]  # fmt: skip
+    head = ("experiment, method", "policies", "rank correlation", "all", "kept", "best of each run", "kept is best")
+    return f"""## The choice among trainings
+
+Of several trainings the one is kept whose mean actions come closest to the weighted demonstrations; returns play no
+part. The correlation is between that distance and the return over all policies, so -1 would be perfect; then mean
+returns of all policies, of those kept, and of the best of each run. {_made("selection.json", measured)}
+
+{lines(head, rows, escape=False)}"""
+
+
+def _dynamics(dynamics: dict[str, float]) -> str:
+    return ", ".join(f"{key} {value:g}" for key, value in dynamics.items()) or "as it is"
+
+
+def _made(file: str, measured: dict[str, Any]) -> str:
+    raw = measured.get("raw_hopper_steps_per_s")
+    rate = f", raw Hopper `mj_step` {raw:,.0f} a second and core beside other work" if raw else ""
+    return f"From [{file}](../benchmarks/results/{file}); {measured['machine']['time'][:10]}{rate}."
 
 
 def speed() -> str:
