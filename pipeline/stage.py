@@ -69,8 +69,8 @@ def _finished(artifact: Artifact | None, name: str) -> Artifact:
 
 
 LEARNING_S = 25e-6
-"""Seconds of one core that learning takes for each environment step, measurements along the way included; on a machine
-that does 15,000 steps of Hopper in a second (docs/measurements.md)."""
+"""Seconds of one core that learning takes for each environment step, measurements along the way included; by hand, on a
+machine that does 15,000 steps of Hopper in a second."""
 
 
 @dataclass(frozen=True)
