@@ -3,8 +3,8 @@
 For every seed: the true return of mean and of sampled actions along the training, environment steps until mean actions
 first reach the task's target, and the share of final episodes that reach it. Constants are chosen with ``--dynamics
 choosing``, imitators that no table uses, and reported with ``--dynamics reported``. ``--set KEY=VALUE`` changes a field
-of the training, such as ``discriminator.gradient_penalty=0`` or ``policy_optimizer.kind=ppo``. What the file has of the
-same question is not trained again.
+of the training, such as ``discriminator.gradient_penalty=0`` or ``policy_optimizer.kind=ppo``. What ``--json FILE``
+has already is not trained again; remove it when the code has changed.
 
 Run ``python benchmarks/gail_reference.py hopper walker2d --seeds 10-14 --dynamics reported --json FILE``.
 """
@@ -149,11 +149,11 @@ def run_seed(name: str, dynamics: str, seed: int, config: GailConfig, keep: Path
 
 
 def finished(path: Path | None, asked: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the results of the same question that a file has from an interrupted call."""
+    """Return the results that a file has from an interrupted call with the same settings and libraries."""
     if path is None or not path.exists():
         return []
     found: dict[str, Any] = json.loads(path.read_text())
-    same = all(found[key] == asked[key] for key in ("dynamics", "set"))
+    same = all(found[key] == asked[key] for key in ("dynamics", "set", "versions"))
     return found["seeds"] if same else []
 
 

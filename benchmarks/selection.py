@@ -18,18 +18,18 @@ import oodil
 
 
 def trainings_of(experiment: Path) -> dict[str, list[dict[str, Any]]]:
-    """Return the trainings of every finished policy by method, those of one run one after another."""
+    """Return, by method, the trainings of each finished policy that had several; the first is the one that was kept."""
     found = defaultdict(list)
     for folder in sorted(path.parent for path in experiment.glob("*/config.json") if path.parent.name != "runner"):
         run = oodil.open_run(folder)
         for stage in run.policies:
-            if run.is_done(stage.name):
-                kept, *others = run.trainings(stage.name).trainings
+            trainings = run.trainings(stage.name).trainings if run.is_done(stage.name) else ()
+            if len(trainings) > 1:
                 found[stage.name].append(
                     {
                         "run": folder.name,
-                        "distances": [kept.distance, *(each.distance for each in others)],
-                        "returns": [kept.mean_return, *(each.mean_return for each in others)],
+                        "distances": [training.distance for training in trainings],
+                        "returns": [training.mean_return for training in trainings],
                     }
                 )
     return found
@@ -38,14 +38,14 @@ def trainings_of(experiment: Path) -> dict[str, list[dict[str, Any]]]:
 def judged(runs: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the correlation over all policies, and what the choice within runs was worth."""
     distances, returns = (np.concatenate([run[key] for run in runs]) for key in ("distances", "returns"))
-    several = [np.array(run["returns"]) for run in runs if len(run["returns"]) > 1]
+    by_run = [np.array(run["returns"]) for run in runs]
     return {
         "policies": len(returns),
-        "rank_correlation": float(spearmanr(distances, returns).statistic) if len(returns) > 2 else None,
+        "rank_correlation": float(spearmanr(distances, returns).statistic),
         "mean_return": float(returns.mean()),
-        "kept": float(np.mean([each[0] for each in several])),
-        "best": float(np.mean([each.max() for each in several])),
-        "kept_is_best": int(sum(each[0] == each.max() for each in several)),
+        "kept": float(np.mean([each[0] for each in by_run])),
+        "best": float(np.mean([each.max() for each in by_run])),
+        "kept_is_best": int(sum(each[0] == each.max() for each in by_run)),
         "runs": runs,
     }
 

@@ -1,7 +1,7 @@
 """Write docs/results.md, its figures and the README's table from the committed results: nothing is typed by hand.
 
 Every experiment is a folder of benchmarks/results/experiments/ with the results.json and made.json that `oodil table`
-wrote; a notes.md beside them says why something is as it is.
+wrote; a notes.md beside them says why something is as it is. Further sections are from what benchmarks wrote.
 
 Run ``python docs/make_results.py``.
 """

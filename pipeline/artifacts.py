@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from oodil.pipeline.errors import DamagedArtifactError, StorageError
 
 MANIFEST = "manifest.json"
+RESULTS, MADE = "results.json", "made.json"
+"""What an experiment leaves in its folder: what was found, and how it was made."""
 KEPT_CHECKPOINTS = 2
 
 Value = TypeVar("Value")

@@ -25,7 +25,25 @@ COLLECTION_SIMULATORS = 16
 """Episodes collected side by side; part of what the demonstrations depend on."""
 
 
-class DemonstrationsStage(Stage):
+class CopyStage(Stage):
+    """A stage that takes over what files hold, and needs them no more once it is done."""
+
+    def origin(self, run: Run) -> dict[str, Any]:
+        """Return what names the artifact.
+
+        A finished one is a copy: once its file or an expert is gone, or the run is on another machine, what their
+        content was is taken from there.
+        """
+        try:
+            return super().origin(run)
+        except (DataError, ExpertError):
+            held = read_artifact(run.directory.stage(self.name))
+            if held is None:
+                raise
+            return held.origin | {"version": self.version, "seed": run.config.seed}
+
+
+class DemonstrationsStage(CopyStage):
     """Collects or reads; its artifact is `CollectedDemonstrations`, whose sources are numbered as configured.
 
     Labels and marks are not part of it: they are reported only, and stay in the configuration.
@@ -75,20 +93,6 @@ class DemonstrationsStage(Stage):
             for source in section.sources
         ]
         return common | flags(section) | {"sources": sources, "imitator": config.environment.dynamics}
-
-    def origin(self, run: Run) -> dict[str, Any]:
-        """Return what names the artifact.
-
-        A finished one is a copy: once its file or an expert is gone, or the run is on another machine, what their
-        content was is taken from there.
-        """
-        try:
-            return super().origin(run)
-        except (DataError, ExpertError):
-            held = read_artifact(run.directory.stage(self.name))
-            if held is None:
-                raise
-            return held.origin | {"version": self.version, "seed": run.config.seed}
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the settings without the imitator's dynamics, in which `combine` alone runs experts."""

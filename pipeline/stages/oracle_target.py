@@ -12,13 +12,13 @@ from oodil.pipeline.config import ExpertConfig, RunConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.errors import ConfigError, DataError, ExpertError
 from oodil.pipeline.results import CollectedDemonstrations
-from oodil.pipeline.stage import JobContext, Run, Stage, register
-from oodil.pipeline.stages.demonstrations import check_expert, collect_demonstrations, flags, identity
+from oodil.pipeline.stage import JobContext, Run, register, state_of
+from oodil.pipeline.stages.demonstrations import CopyStage, check_expert, collect_demonstrations, flags, identity
 from oodil.pipeline.stages.experts import load_expert
 from oodil.pipeline.stages.policies import PolicyStage
 
 
-class TargetDemonstrationsStage(Stage):
+class TargetDemonstrationsStage(CopyStage):
     """Collects from the expert of `oracle_target`, by the same rules as from the sources of a mixture."""
 
     name = "target_demonstrations"
@@ -31,6 +31,8 @@ class TargetDemonstrationsStage(Stage):
 
     def check_files(self, config: RunConfig, observation_dim: int, run: Run | None = None) -> None:
         """Raise DataError or ExpertError, before any work, unless the expert acts in the imitator's own dynamics."""
+        if run is not None and state_of(self, run).state == "done":
+            return
         section, environment = _section(config), config.environment
         check_expert(section, environment, observation_dim)
         if section.expert_folder is None:

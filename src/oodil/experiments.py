@@ -14,13 +14,12 @@ from typing import Any
 
 from oodil.bench import machine, raw_rate
 from oodil.orchestrator import Observer, check_inputs, execute, finished, open_run, read_run, refuse_to_replace
-from oodil.pipeline.artifacts import Files, RunDirectory, encode_json, write_artifact, write_file
+from oodil.pipeline.artifacts import MADE, RESULTS, Files, RunDirectory, encode_json, write_artifact, write_file
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.errors import ConfigError, StorageError, UnfinishedError
 from oodil.pipeline.experiment import ExperimentConfig, PlannedRun, plan
 from oodil.pipeline.locks import held
 from oodil.pipeline.records import records
-from oodil.pipeline.report.table.records import MADE, RESULTS
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.stage import JobContext, JobStoppedError, Run, Stage, register
 from oodil.pipeline.stages import stages as stages_of

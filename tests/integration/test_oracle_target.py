@@ -1,5 +1,6 @@
 """The oracle of the imitator's own dynamics: its demonstrations lie beside those of the mixture, never among them."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,17 @@ def test_bad_input_starts_nothing(tmp_path: Path) -> None:
     assert "was trained with gravity 9.8; the imitator has gravity 12" in refused(wrong)
     other = f"oracle_target={{expert: {EXPERTS}/walker2d-friction-24.8, count: 1}}"
     assert "the expert sees 18 dimensions; environment oodil/Hopper-v0 has 12" in refused(other)
+
+
+def test_finished_demonstrations_need_their_expert_no_more(results: oodil.RunResults, tmp_path: Path) -> None:
+    expert, path = tmp_path / "expert", tmp_path / "run"
+    shutil.copytree(EXPERTS / "hopper-gravity-12.0", expert)
+    overrides = [OVERRIDES[0], f"oracle_target={{expert: {expert}, count: 2}}"]
+    oodil.run(MICRO, overrides, workers=0, until="target_demonstrations", run_dir=path)
+    shutil.rmtree(expert)
+    result = CliRunner().invoke(app, ["resume", str(path), "--workers", "0"])
+    assert result.exit_code == 0, result.output
+    assert artifacts(path) == artifacts(results.path)
 
 
 def test_an_expert_that_is_not_asked_for_is_not_looked_at(tmp_path: Path) -> None:

@@ -55,6 +55,8 @@ def test_an_unchanged_table_computes_nothing(whole: Path) -> None:
     before = {name: artifacts(whole / name) for name in RUNS}
     kept = [whole / "results.json", whole / "made.json", whole / "all-seed0" / "events.jsonl"]
     contents = [path.read_bytes() for path in kept]
+    table = Table.of(load_experiment(str(whole.parent / "experiment.yaml")), whole)
+    assert table.unfinished(table.select(None, None)) == {}
     run(*command(whole.parent, 2))
     assert [path.read_bytes() for path in kept] == contents
     assert {name: artifacts(whole / name) for name in RUNS} == before

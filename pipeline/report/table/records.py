@@ -6,9 +6,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
+from oodil.pipeline.artifacts import MADE, RESULTS
 from oodil.pipeline.errors import DataError
-
-RESULTS, MADE = "results.json", "made.json"
 
 Number = int | float
 """An integer stays one, so that it is written as one."""

@@ -34,9 +34,9 @@ def table(
     """Make a table of an experiment; what is finished is reused, what was interrupted goes on."""
     from oodil.bench import usable_cores
     from oodil.experiments import Table
+    from oodil.pipeline.artifacts import MADE
     from oodil.pipeline.experiment import load_experiment
     from oodil.pipeline.report.table import write_table
-    from oodil.pipeline.report.table.records import MADE
     from oodil.workers.engine import Outcome
 
     experiment = load_experiment(source)
