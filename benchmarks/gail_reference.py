@@ -80,6 +80,10 @@ TASKS = {
         "oodil/Panda20Hz-v0", "hand-written", {"joint_1": 0},
         {"joint_1": 0, "joint_3": 0}, {"joint_1": 0, "joint_5": 0}, 140, 500, 500_000, 500,
     ),
+    "panda_elbow": Task(
+        "oodil/Panda20Hz-v0", "hand-written", {"joint_4": 0},
+        {"joint_1": 0, "joint_3": 0, "joint_4": 0}, {"joint_1": 0, "joint_4": 0}, 90, 500, 500_000, 500,
+    ),
 }  # fmt: skip
 
 
