@@ -153,19 +153,8 @@ class PlannedRun:
 
     @cached_property
     def parts(self) -> dict[str, str]:
-        """What the jobs of each of its stages will compute, by stage: a text that is equal where the artifacts will be.
-
-        It is known before anything is computed. Measurements, which are in no fingerprint, are part of it: they are
-        part of the artifacts.
-        """
-        parts: dict[str, str] = {}
-        whole: dict[str, str] = {}
-        for stage in stages(self.config):
-            inputs = [whole[name] for name in stage.inputs]
-            made_of = [stage.name, stage.version, self.seed, self.config.evaluation.model_dump(), inputs]
-            parts[stage.name] = fingerprint([*made_of, stage.job_settings(self.config)])
-            whole[stage.name] = fingerprint([*made_of, stage.settings(self.config)])
-        return parts
+        """Its `parts_of`."""
+        return parts_of(self.config)
 
     def stages(self, methods: Collection[str]) -> list[Stage]:
         """Return the stages that some of its methods need, each after those it reads from."""
@@ -175,6 +164,22 @@ class PlannedRun:
             if stage.name in needed:
                 needed.update(stage.inputs)
         return [stage for stage in every if stage.name in needed]
+
+
+def parts_of(config: RunConfig) -> dict[str, str]:
+    """Return what the jobs of each stage of a run compute, by stage: a text that is equal where the artifacts are.
+
+    It is known before anything is computed. Measurements, which are in no fingerprint, are part of it: they are part of
+    the artifacts.
+    """
+    parts: dict[str, str] = {}
+    whole: dict[str, str] = {}
+    for stage in stages(config):
+        inputs = [whole[name] for name in stage.inputs]
+        made_of = [stage.name, stage.version, config.seed, config.evaluation.model_dump(), inputs]
+        parts[stage.name] = fingerprint([*made_of, stage.job_settings(config)])
+        whole[stage.name] = fingerprint([*made_of, stage.settings(config)])
+    return parts
 
 
 def plan(experiment: ExperimentConfig) -> list[PlannedRun]:

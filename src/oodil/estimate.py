@@ -8,6 +8,7 @@ import numpy as np
 
 from oodil.bench import usable_cores
 from oodil.experiments import Table
+from oodil.orchestrator import read_run
 from oodil.pipeline.artifacts import fingerprint
 from oodil.pipeline.config import EnvironmentConfig
 from oodil.pipeline.environments import make_batch
@@ -77,7 +78,7 @@ class Outlook:
     cost: StageCost
     """Of the stages that it computes itself, in one process."""
     finished: list[str]
-    """Stages that some run of the table has finished."""
+    """Stages that some run of the table, or of one beside it, has finished."""
     shared: list[str]
     """Stages that a run before it in the list computes."""
     own: list[str]
@@ -87,11 +88,12 @@ class Outlook:
 def outlook(table: Table, selected: dict[str, list[Stage]]) -> list[Outlook]:
     """Return what is left to do for the selected runs, in their order."""
     runs = {run.name: run for run in table.runs}
-    results = {run.name: RunResults(table.opened(run)) for run in table.runs}
+    found = [(RunResults(table.opened(run)), run.parts) for run in table.runs]
+    found += [(RunResults(read_run(table.folder.parent / path)), parts) for path, parts in table.beside().items()]
+    done = {part for results, parts in found for stage, part in parts.items() if results.is_done(stage)}
     rates: dict[str, float] = {}
-    done = {part for run in table.runs for stage, part in run.parts.items() if results[run.name].is_done(stage)}
     taken: set[str] = set()
-    found = []
+    outlooks = []
     for name, stages in selected.items():
         parts, config = runs[name].parts, runs[name].config
         kinds: dict[str, list[Stage]] = {"finished": [], "shared": [], "own": []}
@@ -106,8 +108,8 @@ def outlook(table: Table, selected: dict[str, list[Stage]]) -> list[Outlook]:
         seconds = sum(START_S + cost.core_s for cost in costs)
         cost = StageCost(sum(cost.env_steps for cost in costs), seconds, 1)
         names = {kind: [stage.name for stage in those] for kind, those in kinds.items()}
-        found.append(Outlook(name, cost, **names))
-    return found
+        outlooks.append(Outlook(name, cost, **names))
+    return outlooks
 
 
 def table_cost(found: Sequence[Outlook], workers: int | None) -> RunCost:

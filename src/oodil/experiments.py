@@ -2,6 +2,7 @@
 
 A job executes its run inline, so as many runs are at work at once as the engine has workers. What runs have in common
 is computed once: whoever comes first computes it, the others do something else meanwhile, or wait, and take it over.
+What the tables beside this one have finished is taken over, too.
 """
 
 import json
@@ -17,7 +18,7 @@ from oodil.orchestrator import Observer, check_inputs, execute, finished, open_r
 from oodil.pipeline.artifacts import MADE, RESULTS, Files, RunDirectory, encode_json, write_artifact, write_file
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.errors import ConfigError, StorageError, UnfinishedError
-from oodil.pipeline.experiment import ExperimentConfig, PlannedRun, plan
+from oodil.pipeline.experiment import ExperimentConfig, PlannedRun, parts_of, plan
 from oodil.pipeline.locks import held
 from oodil.pipeline.records import records
 from oodil.pipeline.runs import RunResults
@@ -57,6 +58,23 @@ class Table:
     def opened(self, run: PlannedRun) -> Run:
         """Return a planned run as a run of its folder, whether or not it has begun."""
         return Run(run.config, RunDirectory(self.folder / run.name))
+
+    def beside(self) -> dict[str, dict[str, str]]:
+        """Return the parts of the runs in tables beside this one, by their paths from the folder of all tables.
+
+        Runs of other seeds have nothing in common with it and are left out.
+        """
+        seeds, found = {run.seed for run in self.runs}, {}
+        for file in sorted(self.folder.parent.glob(f"*/*/{self.runner.config.name}")):
+            if file.parents[1].name == self.folder.name:
+                continue
+            try:
+                config = read_run(file.parent).config
+            except ConfigError:
+                continue  # of another version, or no run at all
+            if config.seed in seeds:
+                found["/".join(file.parts[-3:-1])] = parts_of(config)
+        return found
 
     def select(self, rows: Collection[str] | None, methods: Collection[str] | None) -> dict[str, list[Stage]]:
         """Return the stages that some rows and methods need, by run, the longest run first.
@@ -109,7 +127,8 @@ class Table:
                 open_run(self.folder / name, configs[name])
             chosen = {name: [stage.name for stage in found] for name, found in selected.items()}
             parts = {run.name: run.parts for run in self.runs}
-            write_file(self.runner.path / _PLAN, encode_json({"chosen": chosen, "parts": parts}))
+            described = {"chosen": chosen, "parts": parts, "beside": self.beside()}
+            write_file(self.runner.path / _PLAN, encode_json(described))
             whole = Run(configs[next(iter(selected))], self.runner)
             write_file(self.runner.config, (whole.config.model_dump_json(indent=2) + "\n").encode())
             return engine.run_jobs(WholeRuns(), whole, list(selected), on_event, should_stop)
@@ -159,7 +178,8 @@ class WholeRuns(Stage):
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Execute one run inline. A stage that fails leaves those alone that do not read from it."""
         folder, described = run.directory.path.parent, json.loads((run.directory.path / _PLAN).read_bytes())
-        own, chosen, parts = read_run(folder / job), described["chosen"][job], described["parts"]
+        own, chosen = read_run(folder / job), described["chosen"][job]
+        parts, beside = described["parts"], described["beside"]
         stages = [stage for stage in stages_of(own.config) if stage.name in chosen]
         shown, reasons = _Shown(own, stages, context), list[str]()
         while stages:
@@ -171,7 +191,9 @@ class WholeRuns(Stage):
                 with held(lock) if others else nullcontext(True) as is_mine:
                     if not is_mine:
                         continue
-                    _take_over(stage, own, [RunDirectory(folder / name) for name in others])
+                    mates = [RunDirectory(folder / name) for name in others]
+                    elsewhere = [path for path in beside if beside[path].get(stage.name) == part]
+                    _take_over(stage, own, mates, [RunDirectory(folder.parent / path) for path in elsewhere])
                     reason = _execute(stage, own, shown, context)
                 stages.remove(stage)
                 if reason:
@@ -210,13 +232,13 @@ def _without_what_follows(failed: Stage, stages: Sequence[Stage]) -> list[Stage]
     return left
 
 
-def _take_over(stage: Stage, run: Run, others: Sequence[RunDirectory]) -> None:
-    """Copy what other runs have finished of a stage, and go on with the jobs that they have begun.
+def _take_over(stage: Stage, run: Run, others: Sequence[RunDirectory], elsewhere: Sequence[RunDirectory]) -> None:
+    """Copy what other runs have finished of a stage, and go on with the jobs that those of this table have begun.
 
-    An artifact of the same origin has the same bytes, whoever made it.
+    An artifact of the same origin has the same bytes, whoever made it; what runs elsewhere have begun may be at work.
     """
     for job in stage.jobs(run):
-        theirs = [other.job(stage.name, job) for other in others]
+        theirs = [other.job(stage.name, job) for other in (*others, *elsewhere)]
         if _is_there(run.directory.job(stage.name, job), stage.job_origin(run, job), theirs):
             stage.checkpoints(run, job).clear()
             continue
@@ -227,7 +249,8 @@ def _take_over(stage: Stage, run: Run, others: Sequence[RunDirectory]) -> None:
             own.folder.parent.mkdir(parents=True, exist_ok=True)
             begun[0].rename(own.folder)
     if all(finished(run.directory.job(stage.name, job), stage.job_origin(run, job)) for job in stage.jobs(run)):
-        _is_there(run.directory.stage(stage.name), stage.origin(run), [other.stage(stage.name) for other in others])
+        theirs = [other.stage(stage.name) for other in (*others, *elsewhere)]
+        _is_there(run.directory.stage(stage.name), stage.origin(run), theirs)
 
 
 def _is_there(path: Path, origin: dict[str, Any], others: Sequence[Path]) -> bool:

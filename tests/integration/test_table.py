@@ -9,7 +9,7 @@ import pytest
 import oodil
 from oodil.experiments import Table
 from oodil.pipeline.experiment import load_experiment
-from tests.runs import LiveRun, artifacts, has_checkpoint, interrupt, nothing_left, run, wait_for
+from tests.runs import LiveRun, artifacts, has_checkpoint, interrupt, nothing_left, run, wait_for, without_baselines
 from tests.tables import RUNS, SHORT, write_experiment
 
 pytestmark = pytest.mark.timeout(600)
@@ -119,6 +119,17 @@ def test_what_runs_have_in_common_is_computed_once(tmp_path: Path) -> None:
     kept = next(planned for planned in table.runs if planned.name == "only-kept-seed0")
     alone = oodil.run(kept.config, workers=0, run_dir=tmp_path / "alone")
     assert artifacts(alone.path) == artifacts(tmp_path / "micro" / "only-kept-seed0")
+
+
+def test_what_a_table_beside_it_has_finished_is_taken_over(whole: Path, tmp_path: Path) -> None:
+    experiment = str(write_experiment(tmp_path, name="second", seeds=1, methods=["imitation"], published={}))
+    options = ["--folder", str(whole.parent), "--workers", "1"]
+    assert "2 runs: 0 stages to compute, 0 to take over, 10 finished" in run("table", experiment, *options, "--plan")
+    run("table", experiment, *options)
+    for name in ("some-seed1", "all-seed1"):
+        events = (whole.parent / "second" / name / "events.jsonl").read_text()
+        assert "run_finished" in events and "stage_started" not in events
+        assert artifacts(whole.parent / "second" / name) == without_baselines(artifacts(whole / name))
 
 
 def test_one_that_fails_leaves_the_others_alone_and_is_named(tmp_path: Path) -> None:
