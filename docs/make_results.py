@@ -31,9 +31,7 @@ HEAD = """# Results
 
 This page is written by `python docs/make_results.py` from the files of
 `benchmarks/results/`. Returns are of the last policy's mean actions. With five seeds
-or more there is the interquartile mean (IQM) with its 95 % interval; fewer are listed and have none.
-Earlier runs, with other settings, are in
-[measurements.md](measurements.md#whole-runs-before-experiments-were-files)."""
+or more there is the interquartile mean (IQM) with its 95 % interval; fewer are listed and have none."""
 
 
 def tables(folder: Path = EXPERIMENTS) -> dict[str, Table]:
