@@ -1,13 +1,13 @@
-"""The paper's generalization experiment (C.5) for one seed: a run, demonstrations that come later, fine-tuning.
+"""The paper's generalization experiment (C.5): demonstrations that come later, for runs of ``oodil table figure4a``.
 
-1. Every method, on the first four sources of ``configs/walker2d_generalization.yaml`` (Fig. 4 a).
-2. What each weighting that can, frozen, says of the demonstrations of the other three.
-3. Our policy goes on with all of them, weighed by each of these weightings in turn (Fig. 4 b).
+1. What each weighting of a run that can, frozen, says of the demonstrations of three more frictions.
+2. Our policy goes on with all of them, weighed by each of these weightings in turn (Fig. 4 b).
 
-Runs lie in ``--runs`` and are resumed; ``--json`` is written after each step. Run
-``python benchmarks/generalization.py --seed 20 --runs FOLDER --json FILE``.
+What is fine-tuned lies in ``--folder`` and is resumed; ``--json`` is written after each step and keeps other seeds. Run
+``python benchmarks/generalization.py tables/figure4a/*-seed* --folder FOLDER --json FILE``.
 """
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,16 +26,7 @@ from oodil.pipeline.runs import separation_metrics
 from oodil.pipeline.verdicts import VerdictTable
 
 KNOWN = 4
-"""Sources that the run has from the beginning; the others come later."""
-METHODS = "naive_gail", "oracle", "f_mdp", "id_random", "id_gail", "exact_id"
-"""Policies beside ours; those whose weighting can score other demonstrations are in the later steps, too."""
-
-
-def values_of(config: RunConfig, num_sources: int) -> dict[str, Any]:
-    """Return a configuration with its first sources alone, and every method beside ours."""
-    values = config.model_dump(mode="json") | {"baselines": list(METHODS)}
-    values["demonstrations"]["sources"] = values["demonstrations"]["sources"][:num_sources]
-    return values
+"""Sources of ``configs/walker2d_generalization.yaml`` that a run has from the beginning; the others come later."""
 
 
 def later(results: oodil.RunResults) -> Demonstrations:
@@ -45,85 +36,66 @@ def later(results: oodil.RunResults) -> Demonstrations:
     return replace(chosen, sources=chosen.sources - KNOWN, source_labels=chosen.source_labels[KNOWN:])
 
 
-def policy_line(results: oodil.RunResults, name: str) -> dict[str, Any]:
-    """Return what a policy reaches, and its learning curve."""
-    final, curve = results.evaluation(name), results.curve(name)
-    return {
-        "mean_return": final.mean_return,
-        "std_return": final.std_return,
-        "mean_length": final.mean_length,
-        "env_steps": results.policy(name).env_steps,
-        "curve": {"env_steps": curve.env_steps.tolist(), "mean_return": curve.mean_return.tolist()},
-    }
-
-
-def base_figures(results: oodil.RunResults) -> dict[str, Any]:
-    """Return what every method has found on the first sources, and what it took."""
-    return {
-        "policies": {each.name: policy_line(results, each.name) for each in results.policies},
-        "weightings": {each.name: results.separation(each.name) for each in results.weightings},
-        "purity": results.cluster_diagnostics.purity,
-        "env_steps": results.env_steps(),
-        "seconds": results.seconds(),
-    }
-
-
-def later_figures(scored: oodil.Scored, config: RunConfig) -> dict[str, Any]:
+def frozen(scored: oodil.Scored, config: RunConfig) -> dict[str, Any]:
     """Return what the frozen weightings say of later demonstrations alone: by source, and against the marks."""
     demonstrations = scored.demonstrations
     by_source = np.array([source.transferable is True for source in config.demonstrations.sources[KNOWN:]])
     marks = by_source[demonstrations.sources]
-    found = {
+    return {
         name: separation_metrics(marks, each.scores, each.weights, demonstrations)
         | {"verdicts": VerdictTable.of(each, demonstrations).describe()}
         for name, each in scored.found.items()
     }
-    return {"weightings": found, "refused": scored.refused}
+
+
+def finetuned(results: oodil.RunResults) -> dict[str, Any]:
+    """Return what a fine-tuned policy reaches, its learning curve, and on what weights it went on."""
+    final, curve = results.evaluation("finetuning"), results.curve("finetuning")
+    return results.separation("later_scores") | {
+        "mean_return": final.mean_return,
+        "std_return": final.std_return,
+        "curve": {"env_steps": curve.env_steps.tolist(), "mean_return": curve.mean_return.tolist()},
+        "seconds": results.seconds(),
+    }
 
 
 def main() -> None:
     parser = arguments_of(__doc__)
-    parser.add_argument("--seed", type=int, default=20)
-    parser.add_argument("--runs", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("run_dirs", type=Path, nargs="+", metavar="RUN_DIR")
+    parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--workers", type=int, help="default: as configured")
-    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="overrides of every run")
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="overrides of each fine-tuning")
     arguments = parser.parse_args()
-    folder, workers = arguments.runs / f"seed{arguments.seed}", arguments.workers
-    figures = circumstances() | {"raw_hopper_steps_per_s": raw_rate(), "seed": arguments.seed, "set": arguments.set}
-    config = load_config("walker2d_generalization", [f"seed={arguments.seed}", *arguments.set])
-    sources = config.demonstrations.sources
-
-    base = oodil.run(values_of(config, KNOWN), workers=workers, run_dir=folder / "base")
-    figures["base"] = base_figures(base)
-    print({name: round(line["mean_return"]) for name, line in figures["base"]["policies"].items()}, flush=True)
-    save(arguments.json, figures)
-
-    collected = oodil.run(
-        values_of(config, len(sources)), workers=workers, run_dir=folder / "all", until="demonstrations"
-    )
-    file = folder / "later.safetensors"
-    write_file(file, encode_demonstrations(later(collected), config.environment.id))
-    scored = oodil.score(base, file)
-    figures["later"] = later_figures(scored, config)
-    for name, line in figures["later"]["weightings"].items():
-        print(name, {key: round(line[key], 3) for key in ("auroc", "share_before", "share")}, flush=True)
-    save(arguments.json, figures)
-
-    marks = ", ".join(source.label for source in sources[KNOWN:] if source.transferable)
-    figures["finetuned"] = {}
-    for name in scored.found:
-        tuned = oodil.finetune(
-            base,
-            file,
-            [f"demonstrations.transferable=[{marks}]"],
-            weighting=name,
-            workers=workers,
-            run_dir=folder / f"finetuned-{name}",
-        )
-        line = policy_line(tuned, "finetuning") | tuned.separation("later_scores") | {"seconds": tuned.seconds()}
-        figures["finetuned"][name] = line
-        print(f"fine-tuned by {name}:", round(line["mean_return"]), flush=True)
-        save(arguments.json, figures)
+    file = arguments.json
+    seeds = json.loads(file.read_text())["seeds"] if file and file.exists() else {}
+    figures = circumstances() | {"raw_hopper_steps_per_s": raw_rate(), "set": arguments.set, "seeds": seeds}
+    for run_dir in arguments.run_dirs:
+        base = oodil.open_run(run_dir)
+        seed, folder = base.config.seed, arguments.folder / f"seed{base.config.seed}"
+        config = load_config("walker2d_generalization", [f"seed={seed}"])
+        collected = oodil.run(config, workers=arguments.workers, run_dir=folder / "all", until="demonstrations")
+        recorded = folder / "later.safetensors"
+        write_file(recorded, encode_demonstrations(later(collected), config.environment.id))
+        scored = oodil.score(base, recorded)
+        found: dict[str, Any] = {"before": base.evaluation().mean_return, "frozen": frozen(scored, config)}
+        found |= {"refused": scored.refused, "finetuned": {}}
+        seeds[str(seed)] = found
+        for name, line in found["frozen"].items():
+            print(seed, name, {key: round(line[key], 3) for key in ("auroc", "share_before", "share")}, flush=True)
+        save(file, figures)
+        marks = ", ".join(source.label for source in config.demonstrations.sources[KNOWN:] if source.transferable)
+        for name in scored.found:
+            tuned = oodil.finetune(
+                base,
+                recorded,
+                [f"demonstrations.transferable=[{marks}]", *arguments.set],
+                weighting=name,
+                workers=arguments.workers,
+                run_dir=folder / name,
+            )
+            found["finetuned"][name] = finetuned(tuned)
+            print(f"{seed} fine-tuned by {name}: {found['finetuned'][name]['mean_return']:,.0f}", flush=True)
+            save(file, figures)
 
 
 if __name__ == "__main__":
