@@ -52,13 +52,8 @@ def paths(demonstrations: Demonstrations, weights: NDArray[np.float64], looks: l
         for axes in panels.flat[len(present) :]:
             axes.set_visible(False)
         for axes, source in zip(panels.flat, present, strict=False):
-            _plane(axes, world)
             mine = np.flatnonzero(demonstrations.sources == source)
-            mine = mine[np.argsort(weights[mine], kind="stable")]
-            drawn = LineCollection(
-                [lines[n] for n in mine], array=weights[mine], cmap=SHADES, norm=depth, linewidths=0.9, rasterized=True
-            )
-            axes.add_collection(drawn)
+            _panel(axes, [lines[n] for n in mine], weights[mine], depth, world)
             look = looks[source]
             axes.set_title(f"{look.glyph} {len(mine)} paths", color=look.color, fontweight="bold")
         bar = figure.colorbar(
@@ -67,6 +62,35 @@ def paths(demonstrations: Demonstrations, weights: NDArray[np.float64], looks: l
         )  # fmt: skip
         bar.outline.set_visible(False)
     return Markup(svg.getvalue())
+
+
+def sheet(demonstrations: Demonstrations, weightings: Mapping[str, NDArray[np.float64]], world: Layout) -> str:
+    """Draw the same on one white sheet, a row for each of several (N,) weightings and a column for each source."""
+    lines = np.split(positions(demonstrations.observations), demonstrations.offsets[1:-1])
+    present = np.unique(demonstrations.sources).tolist()
+    with drawing("sheet", 3.2 * len(present), 0.3 + 3.1 * len(weightings)) as (figure, svg):
+        figure.set_facecolor("white")
+        grid = figure.subplots(len(weightings), len(present), squeeze=False)
+        for row, (title, weights) in zip(grid, weightings.items(), strict=True):
+            row[0].set_ylabel(title, fontweight="bold", fontsize=11)
+            for axes, source in zip(row, present, strict=True):
+                mine = np.flatnonzero(demonstrations.sources == source)
+                _panel(axes, [lines[n] for n in mine], weights[mine], Normalize(0, weights.max()), world)
+        for axes, source in zip(grid[0], present, strict=True):
+            axes.set_title(demonstrations.source_labels[source], fontweight="bold")
+    return svg.getvalue()
+
+
+def _panel(
+    axes: Axes, lines: list[NDArray[np.float64]], weights: NDArray[np.float64], depth: Normalize, world: Layout
+) -> None:
+    """Draw paths over the plane, shaded by their weights."""
+    _plane(axes, world)
+    order = np.argsort(weights, kind="stable")
+    drawn = LineCollection(
+        [lines[n] for n in order], array=weights[order], cmap=SHADES, norm=depth, linewidths=0.9, rasterized=True
+    )
+    axes.add_collection(drawn)
 
 
 def _plane(axes: Axes, world: Layout) -> None:
