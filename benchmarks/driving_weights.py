@@ -3,7 +3,7 @@
 A demonstration can be reproduced if it drives at the imitator's speed and never touches the imitator's obstacles. For
 every weighting of a run: the AUROC of that truth, its share of the sampling mass before and after weighting, and scores
 by source and by whether the path is clear; for every policy, how many episodes reach the goal, also by the third of the
-start line that they begin in. ``--picture FILE`` draws the paths of the first run, shaded by each weighting.
+start line that they begin in. ``--picture FILE`` draws the paths of the last run, shaded by each weighting.
 
 Run ``python benchmarks/driving_weights.py RUN_DIR... --json FILE``.
 
@@ -89,12 +89,12 @@ def figures_of(results: RunResults, num_episodes: int) -> dict[str, Any]:
         "reproducible": int(reproducible.sum()),
         "purity": results.cluster_diagnostics.purity,
         "weightings": {
-            each.name: judged(results.weighting(each.name), demonstrations, clear, reproducible)
+            each.title: judged(results.weighting(each.name), demonstrations, clear, reproducible)
             for each in results.weightings
             if results.is_done(each.name)
         },
         "policies": {
-            each.name: driven(results, each.name, num_episodes)
+            each.title: driven(results, each.name, num_episodes)
             for each in results.policies
             if results.is_done(each.name)
         },
@@ -106,7 +106,7 @@ def main() -> None:
     parser = arguments_of(__doc__)
     parser.add_argument("run_dirs", type=Path, nargs="+", metavar="RUN_DIR")
     parser.add_argument("--episodes", type=int, default=1000)
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="an SVG of the first run's paths")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="an SVG of the last run's paths")
     arguments = parser.parse_args()
     figures: dict[str, Any] = circumstances() | {"episodes": arguments.episodes, "runs": []}
     for run_dir in arguments.run_dirs:
@@ -120,7 +120,7 @@ def main() -> None:
             print(f"  {name}: {line['share_reached']:.1%} arrive ({thirds}), return {line['mean_return']:.0f}")
     save(arguments.json, figures)
     if arguments.picture:
-        results = oodil.open_run(arguments.run_dirs[0])
+        results = oodil.open_run(arguments.run_dirs[-1])
         done = [each for each in results.weightings if results.is_done(each.name)]
         weights = {each.title: results.weighting(each.name).weights for each in done}
         drawn = sheet(results.demonstrations, weights, layout(results.config.environment))

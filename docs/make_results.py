@@ -50,7 +50,7 @@ def page(folder: Path = EXPERIMENTS) -> str:
         notes = folder / name / "notes.md"
         reasons = f"### Why\n\n{notes.read_text(encoding='utf-8').strip()}" if notes.is_file() else ""
         parts.append(markdown(table, level=2, below="\n\n".join(part for part in (pictures, reasons) if part)).strip())
-    parts += [alone(), controls(), choice(), speed()]
+    parts += [alone(), paths(), controls(), choice(), speed()]
     return "\n\n".join(parts) + "\n"
 
 
@@ -152,6 +152,39 @@ GAIL with the one setting, on demonstrations of one source that the imitator can
 share of 100 final episodes of each seed that are above the target. {_made(file, measured)}
 
 {lines(head, rows, escape=False)}"""
+
+
+def paths() -> str:
+    """Return what every weighting makes of Driving's paths, whose truth is known exactly, and what policies do."""
+    measured = json.loads((MEASURED / "driving_weights.json").read_text())
+    weightings, policies = [], []
+    for name in dict.fromkeys(name for run in measured["runs"] for name in run["weightings"]):
+        each = [run["weightings"][name] for run in measured["runs"] if name in run["weightings"]]
+        shares = (formats.percent(fmean(one[key] for one in each)) for key in ("share_before", "share"))
+        aurocs = ", ".join(f"{one['auroc']:.3f}" for one in each)
+        weightings.append((name, f"{fmean(one['auroc'] for one in each):.3f} ({aurocs})", " → ".join(shares)))
+    for name in dict.fromkeys(name for run in measured["runs"] for name in run["policies"]):
+        each = [run["policies"][name] for run in measured["runs"] if name in run["policies"]]
+        reached = [formats.percent(one["share_reached"]) for one in each]
+        thirds = (formats.percent(fmean(one["by_third"][i] for one in each)) for i in range(3))
+        policies.append((name, ", ".join(reached), ", ".join(thirds)))
+    runs = ", ".join(f"{run['run']} ({run['reproducible']})" for run in measured["runs"])
+    return f"""## Driving's paths
+
+Which paths can be reproduced is known exactly there: those at the imitator's speed that touch none of its obstacles.
+The AUROC of that truth and its share of the sampling mass, means over runs, and each run in parentheses; below, the
+share of {measured["episodes"]:,} starts from which each policy arrives, by run, and by the third of the start line.
+Runs, and how many of their {measured["runs"][0]["paths"]} paths can be reproduced: {runs}.
+{_made("driving_weights.json", measured)}
+
+{lines(("weighting", "AUROC", "share before → after"), weightings, escape=False)}
+
+{lines(("policy", "starts that arrive", "left, middle and right third"), policies, escape=False)}
+
+![Paths by source, shaded by what each weighting makes of them, over the imitator's obstacles](driving_weights.svg)
+
+Paths of {measured["runs"][-1]["run"]}: dark is the heaviest of a row, pale has no weight, orange are the imitator's
+obstacles and green is the goal. *marks* are those of the configuration, which leave the second source out."""
 
 
 def controls() -> str:

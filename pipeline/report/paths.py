@@ -68,7 +68,7 @@ def sheet(demonstrations: Demonstrations, weightings: Mapping[str, NDArray[np.fl
     """Draw the same on one white sheet, a row for each of several (N,) weightings and a column for each source."""
     lines = np.split(positions(demonstrations.observations), demonstrations.offsets[1:-1])
     present = np.unique(demonstrations.sources).tolist()
-    with drawing("sheet", 3.2 * len(present), 0.3 + 3.1 * len(weightings)) as (figure, svg):
+    with drawing("sheet", 3.2 * len(present), 0.3 + 2.75 * len(weightings)) as (figure, svg):
         figure.set_facecolor("white")
         grid = figure.subplots(len(weightings), len(present), squeeze=False)
         for row, (title, weights) in zip(grid, weightings.items(), strict=True):
