@@ -1,8 +1,8 @@
 """What a run will cost: environment steps, which follow from its configuration, and time, from a short measurement."""
 
 import time
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -29,6 +29,8 @@ class StageCost:
     env_steps: int
     seconds: float
     jobs: int
+    shares: Mapping[str, float] = field(default_factory=dict)
+    """By job, its share of the seconds; empty where jobs are alike."""
 
 
 @dataclass(frozen=True)
@@ -114,11 +116,12 @@ def outlook(table: Table, selected: dict[str, list[Stage]]) -> list[Outlook]:
 
 def table_cost(found: Sequence[Outlook], workers: int | None) -> RunCost:
     """Return what the rest of an experiment will cost, as one stage whose jobs are its runs."""
-    seconds = [each.cost.seconds for each in found]
+    seconds = {each.name: each.cost.seconds for each in found}
     at_once = max(1, min(workers or 1, usable_cores(), sum(each.cost.env_steps > 0 for each in found)))
-    steps = sum(each.cost.env_steps for each in found)
-    together = max(sum(seconds) / at_once, max(seconds, default=0.0))
-    return RunCost({"table": StageCost(steps, together, len(found))}, workers)
+    steps, total = sum(each.cost.env_steps for each in found), sum(seconds.values())
+    together = max(total / at_once, max(seconds.values(), default=0.0))
+    shares = {name: each / total for name, each in seconds.items()} if total else {}
+    return RunCost({"table": StageCost(steps, together, len(found), shares)}, workers)
 
 
 def step_seconds(environment: EnvironmentConfig, count: int = 8) -> float:

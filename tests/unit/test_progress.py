@@ -68,6 +68,21 @@ def test_a_run_of_two_stages_by_hand() -> None:
     assert (run.share, run.left_s, run.stage) == (1.0, 0.0, 2)
 
 
+def test_jobs_that_differ_count_for_what_they_cost() -> None:
+    clock = Clock()
+    run = RunProgress({"table": StageCost(0, 100.0, 2, {"long": 0.8, "short": 0.2})}, clock)
+    run.stage_started("table", 2)
+    run.job_advanced("long", 0, 10, {})
+    run.job_advanced("short", 5, 10, {})  # half of it was there
+    clock.now += 20
+    run.job_ended("short", is_done=True)
+    run.job_advanced("long", 5, 10, {})
+    assert run.share == pytest.approx(0.6)
+    # 50 of the 60 were done since the start, in 20 s: pace (20 + 10) / (50 + 10).
+    assert run.left_s == pytest.approx(40 * 0.5)
+    assert run.num_finished == 1
+
+
 def test_reused_stages_and_jobs_that_are_not_there_cost_nothing() -> None:
     run = RunProgress({"a": StageCost(0, 30.0, 1), "b": StageCost(0, 50.0, 5)}, Clock())
     run.stage_reused("a")

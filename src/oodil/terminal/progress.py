@@ -66,7 +66,6 @@ class RunProgress:
         self.jobs: dict[str, JobProgress] = {}
         """Of the current stage, those that run."""
         self.num_jobs = 0
-        self.num_finished = 0
         self._costs = dict(costs)
         self._seconds = {name: cost.seconds for name, cost in costs.items()}
         self._clock = clock
@@ -76,6 +75,9 @@ class RunProgress:
         self._given = 0.0
         """Expected seconds of what was done before."""
         self._given_by_job: dict[str, float] = {}
+        """Shares of the current stage's jobs that were done before."""
+        self._done_jobs: set[str] = set()
+        """Of the current stage."""
         self._began: float | None = None
 
     def stage_reused(self, stage: str) -> None:
@@ -88,7 +90,7 @@ class RunProgress:
         if self._began is None:
             self._began = self._clock()
         self.stage += 1
-        self._current, self.num_jobs, self.num_finished = stage, jobs, 0
+        self._current, self.num_jobs = stage, jobs
         self._forget_jobs()
         if stage in self._costs:
             self._seconds[stage] *= min(1.0, jobs / self._costs[stage].jobs)
@@ -96,7 +98,7 @@ class RunProgress:
     def stage_finished(self) -> None:
         """The current stage is done."""
         self._finished_s += self._seconds.get(self._current, 0.0)
-        self._given += sum(self._given_by_job.values()) * self._job_s
+        self._given += self._given_s
         self._current, self.num_jobs = "", 0
         self._forget_jobs()
 
@@ -113,7 +115,13 @@ class RunProgress:
     def job_ended(self, job: str, is_done: bool) -> None:
         """A job is done, or has to be begun again."""
         self.jobs.pop(job, None)
-        self.num_finished += is_done
+        if is_done:
+            self._done_jobs.add(job)
+
+    @property
+    def num_finished(self) -> int:
+        """Jobs of the current stage that are done."""
+        return len(self._done_jobs)
 
     @property
     def share(self) -> float:
@@ -127,21 +135,27 @@ class RunProgress:
         total = sum(self._seconds.values())
         if not total or self._began is None:
             return None
-        given = self._given + sum(self._given_by_job.values()) * self._job_s
+        given = self._given + self._given_s
         trust = TRUST * total
         pace = (self._clock() - self._began + trust) / (max(self._done_s - given, 0.0) + trust)
         return max(total - self._done_s, 0.0) * pace
 
+    def _job_s(self, job: str) -> float:
+        """Return the expected seconds of a job of the current stage."""
+        cost, alike = self._costs.get(self._current), 1 / max(self.num_jobs, 1)
+        return self._seconds.get(self._current, 0.0) * (cost.shares.get(job, alike) if cost else alike)
+
     @property
-    def _job_s(self) -> float:
-        """Expected seconds of a job of the current stage."""
-        return self._seconds.get(self._current, 0.0) / max(self.num_jobs, 1)
+    def _given_s(self) -> float:
+        return sum(share * self._job_s(job) for job, share in self._given_by_job.items())
 
     @property
     def _done_s(self) -> float:
-        jobs = self.num_finished + sum(job.share for job in self.jobs.values())
-        return self._finished_s + min(jobs, self.num_jobs) * self._job_s
+        done = sum(self._job_s(job) for job in self._done_jobs)
+        done += sum(progress.share * self._job_s(job) for job, progress in self.jobs.items())
+        return self._finished_s + min(done, self._seconds.get(self._current, 0.0))
 
     def _forget_jobs(self) -> None:
         self.jobs.clear()
         self._given_by_job.clear()
+        self._done_jobs.clear()
