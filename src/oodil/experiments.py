@@ -17,7 +17,7 @@ from oodil.bench import machine, raw_rate
 from oodil.orchestrator import Observer, check_inputs, execute, finished, open_run, read_run, refuse_to_replace
 from oodil.pipeline.artifacts import MADE, RESULTS, Files, RunDirectory, encode_json, write_artifact, write_file
 from oodil.pipeline.config import RunConfig
-from oodil.pipeline.errors import ConfigError, StorageError, UnfinishedError
+from oodil.pipeline.errors import ConfigError, OodilError, StorageError, UnfinishedError
 from oodil.pipeline.experiment import ExperimentConfig, PlannedRun, parts_of, plan
 from oodil.pipeline.locks import held
 from oodil.pipeline.records import records
@@ -60,20 +60,20 @@ class Table:
         return Run(run.config, RunDirectory(self.folder / run.name))
 
     def beside(self) -> dict[str, dict[str, str]]:
-        """Return the parts of the runs in tables beside this one, by their paths from the folder of all tables.
+        """Return what runs of the tables beside this one have in common with it, as parts by the run's path.
 
-        Runs of other seeds have nothing in common with it and are left out.
+        Paths begin in the folder of all tables. Runs that cannot be read any more have nothing in common with it.
         """
-        seeds, found = {run.seed for run in self.runs}, {}
+        own, found = {part for run in self.runs for part in run.parts.values()}, {}
         for file in sorted(self.folder.parent.glob(f"*/*/{self.runner.config.name}")):
             if file.parents[1].name == self.folder.name:
                 continue
             try:
-                config = read_run(file.parent).config
-            except ConfigError:
-                continue  # of another version, or no run at all
-            if config.seed in seeds:
-                found["/".join(file.parts[-3:-1])] = parts_of(config)
+                parts = parts_of(read_run(file.parent).config)
+            except OodilError:
+                continue
+            if common := {stage: part for stage, part in parts.items() if part in own}:
+                found["/".join(file.parts[-3:-1])] = common
         return found
 
     def select(self, rows: Collection[str] | None, methods: Collection[str] | None) -> dict[str, list[Stage]]:

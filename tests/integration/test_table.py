@@ -124,6 +124,11 @@ def test_what_runs_have_in_common_is_computed_once(tmp_path: Path) -> None:
 def test_what_a_table_beside_it_has_finished_is_taken_over(whole: Path, tmp_path: Path) -> None:
     experiment = str(write_experiment(tmp_path, name="second", seeds=1, methods=["imitation"], published={}))
     options = ["--folder", str(whole.parent), "--workers", "1"]
+    unreadable = json.loads((whole / "all-seed1" / "config.json").read_bytes())
+    unreadable["demonstrations"] |= {"sources": [], "file": "/nowhere/recorded.safetensors"}
+    for name, text in (("lost", json.dumps(unreadable)), ("foreign", "[]")):
+        (whole.parent / "aside" / name).mkdir(parents=True, exist_ok=True)
+        (whole.parent / "aside" / name / "config.json").write_text(text)
     assert "2 runs: 0 stages to compute, 0 to take over, 10 finished" in run("table", experiment, *options, "--plan")
     run("table", experiment, *options)
     for name in ("some-seed1", "all-seed1"):

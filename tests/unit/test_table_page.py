@@ -16,7 +16,7 @@ from oodil.pipeline.errors import DataError
 from oodil.pipeline.report.table import Table, read_table, write_table
 from oodil.pipeline.report.table.figures import curve_over_seeds, method_looks, plots
 from oodil.pipeline.report.table.grids import findings, grids, notes
-from oodil.pipeline.report.table.texts import how_made, latex, main_table, markdown, over_seeds
+from oodil.pipeline.report.table.texts import explained, how_made, latex, main_table, markdown, over_seeds
 
 ROOT = Path(__file__).parents[2]
 MADE_UP = ROOT / "tests" / "made_up_table"
@@ -112,6 +112,20 @@ def test_what_is_better_is_counted_and_what_is_not_there_is_said():
         "Failed: 1:9, ours, seed 24: OSError: No space left on device",
         "Not there yet: 1:9, naive GAIL, seeds 23, 24",
     ]
+
+
+def test_methods_of_which_the_same_is_missing_are_named_together(folder: Path):
+    missing = [["1:9", method, seed] for method in ("naive_gail", "imitation") for seed in (24, 23)]
+    table = changed(folder, failed=[], missing=[*missing, ["1:9", "oracle", 23]])
+    assert list(notes(table)) == [
+        "Not there yet: 1:9, naive GAIL, ours, seeds 23, 24",
+        "Not there yet: 1:9, oracle, seed 23",
+    ]
+
+
+def test_a_table_names_the_seeds_that_it_has(folder: Path):
+    cells = [cell for cell in json.loads((MADE_UP / "results.json").read_text())["cells"] if cell["seed"] <= 21]
+    assert "standard deviation over seeds 20, 21. " in explained(changed(folder, cells=cells))
 
 
 def test_without_published_figures_the_best_of_a_row_is_marked(folder: Path):

@@ -157,9 +157,12 @@ def notes(table: Table) -> Iterator[str]:
     places: dict[tuple[str, str], list[int]] = {}
     for row, method, seed in records.missing:
         places.setdefault((row, method), []).append(seed)
+    alike: dict[tuple[str, str], list[str]] = {}
     for (row, method), seeds in places.items():
-        listed = ", ".join(map(str, sorted(seeds)))
-        yield f"Not there yet: {row}, {records.methods.get(method, method)}, seed{'s' * (len(seeds) > 1)} {listed}"
+        listed = f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, sorted(seeds)))}"
+        alike.setdefault((row, listed), []).append(records.methods.get(method, method))
+    for (row, listed), methods in alike.items():
+        yield f"Not there yet: {row}, {', '.join(methods)}, {listed}"
 
 
 def findings(table: Table) -> Iterator[str]:

@@ -44,9 +44,10 @@ def over_seeds(table: Table, entry: Entry) -> str:
 def explained(table: Table) -> str:
     """Return how the table is to be read."""
     records = table.records
-    seeds = ", ".join(map(str, records.seeds))
+    known = sorted({seed for entry in table.entries.values() for seed in entry.by_seed})
+    seeds = ", ".join(map(str, known or records.seeds))
     said = f"{table.measure.title.capitalize() if table.measure.title != 'AUROC' else 'AUROC'}: mean ± standard "
-    said += f"deviation over seed{'s' * (len(records.seeds) > 1)} {seeds}. "
+    said += f"deviation over seed{'s' * (len(known or records.seeds) > 1)} {seeds}. "
     if table.marks_rows:
         return said + "Marked: the best of each row."
     if not records.published:
