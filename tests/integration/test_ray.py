@@ -160,12 +160,13 @@ def test_a_node_dies_in_the_middle_of_a_table(tmp_path: Path, cluster: Cluster) 
     longer = [*SHORT, "imitation.gail.total_steps=32_000"]
     file = write_experiment(tmp_path, overrides=longer, methods=["naive_gail"], published={})
     experiment = load_experiment(file)
-    tables = {name: Table.of(experiment, tmp_path / name) for name in ("inline", "ray")}
+    # Not beside each other, or the second would take over what the first has finished.
+    tables = {name: Table.of(experiment, tmp_path / name / experiment.name) for name in ("inline", "ray")}
     selected = {name: table.select(None, None) for name, table in tables.items()}
     second = cluster.worker_nodes
 
     def kill() -> None:
-        wait_until(lambda: any((tmp_path / "ray").glob("*/checkpoints/naive_gail/*/*")), timeout_s=120)
+        wait_until(lambda: any(tables["ray"].folder.glob("*/checkpoints/naive_gail/*/*")), timeout_s=120)
         cluster.remove_node(next(iter(second)), allow_graceful=False)
 
     killer = threading.Thread(target=kill)
