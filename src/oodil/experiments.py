@@ -31,6 +31,8 @@ from oodil.workers.reports import DONE, Event, Finished, Progress, Warn
 
 LEAST_STEPS = 10_000
 """What a stage counts for in the progress of a run, if it takes fewer environment steps."""
+SHORTEST_S = 0.05
+"""A run that took less is not in what a table says of its making."""
 _PLAN = "plan.json"
 
 
@@ -141,18 +143,25 @@ class Table:
         return path
 
     def write_made(self, command: Sequence[str]) -> Path:
-        """Write how it was made: by which command, on what machine, how fast; return the file."""
-        seconds = {run.name: sum(RunResults(self.opened(run)).seconds().values()) for run in self.runs}
+        """Add to how it was made: by which command, on what machine, how fast; return the file.
+
+        Seconds are of the stages that were finished since the last command that is there.
+        """
+        path = self.folder / MADE
+        earlier = json.loads(path.read_bytes()) if path.exists() else []
+        spent = {run.name: sum(RunResults(self.opened(run)).seconds().values()) for run in self.runs}
+        for each in earlier:
+            for name, seconds in each["seconds"].items():
+                spent[name] = spent.get(name, 0) - seconds
         circumstances = {
             # Nobody else has these folders.
             "command": ["oodil", *(Path(each).name if Path(each).is_absolute() else each for each in command)],
             "machine": machine(),
             "raw_hopper_steps_per_s": raw_rate(),
             "versions": library_versions(),
-            "seconds": {name: round(spent, 1) for name, spent in seconds.items() if spent},
+            "seconds": {name: round(seconds, 1) for name, seconds in spent.items() if seconds > SHORTEST_S},
         }
-        path = self.folder / MADE
-        write_file(path, encode_json(circumstances))
+        write_file(path, encode_json([*earlier, circumstances]))
         return path
 
 

@@ -48,7 +48,8 @@ def test_what_a_table_says(whole: Path) -> None:
     assert 0 <= naive["share_reached"] <= 1
     assert naive["auroc"] is None and naive["sources"] == {} and naive["curve"]["env_steps"] == [3_200]
     assert found["random_return"]["some"] == found["random_return"]["all"] < found["expert_return"]["all"]
-    assert json.loads((whole / "made.json").read_bytes())["seconds"].keys() == RUNS
+    (made,) = json.loads((whole / "made.json").read_bytes())
+    assert made["seconds"].keys() == RUNS
 
 
 def test_an_unchanged_table_computes_nothing(whole: Path) -> None:
@@ -95,6 +96,12 @@ def test_an_interrupt_stops_politely(whole: Path, tmp_path: Path) -> None:
     assert len(json.loads((tmp_path / "micro" / "results.json").read_bytes())["cells"]) == 2
     run(*command(tmp_path, 2))
     assert (tmp_path / "micro" / "results.json").read_bytes() == (whole / "results.json").read_bytes()
+    interrupted, part, rest = json.loads((tmp_path / "micro" / "made.json").read_bytes())
+    assert part["command"][-4:] == ["--rows", "all", "--methods", "naive_gail"]
+    assert part["seconds"].keys() == {"all-seed0", "all-seed1"} and rest["seconds"].keys() == RUNS
+    spent = {name: sum(oodil.open_run(tmp_path / "micro" / name).seconds().values()) for name in RUNS}
+    said = {name: sum(each["seconds"].get(name, 0) for each in (interrupted, part, rest)) for name in RUNS}
+    assert said == pytest.approx(spent, abs=0.2)
 
 
 def test_what_runs_have_in_common_is_computed_once(tmp_path: Path) -> None:

@@ -137,9 +137,9 @@ def test_without_published_figures_the_best_of_a_row_is_marked(folder: Path):
 
 
 def test_how_it_was_made_is_one_line():
-    made = read_table(MADE_UP).records.made
+    (made,) = read_table(MADE_UP).records.made
     assert how_made(made) == (
-        "command: oodil table made-up --seeds 20-24; machine: cpu none, cores 2; "
+        "command: oodil table made-up --seeds 20-24; machine: cores 2, cpu none; "
         "raw hopper steps per second: 12,100.4; "
         "2 runs of 1\u00a0min 30\u00a0s on average, 3\u00a0min 00\u00a0s in all; versions: torch 0.0"
     )
@@ -321,3 +321,33 @@ def test_the_results_page_says_what_is_better_than_the_paper_and_what_is_not(fol
     assert "### Why\n\nToo few seeds." in worse and "![seeds: made-up](results/made-up-seeds.svg)" in worse
     for svg in script["figures"](folder.parent).values():
         ElementTree.fromstring(svg)
+
+
+def test_tables_of_several_machines_are_kept_together(folder: Path, tmp_path: Path):
+    """Ours of row 1:1 with seed 24 is made anew, row 1:9 gets a new seed; oracles of that row are not asked for."""
+    keep = runpy.run_path(str(ROOT / "docs" / "keep_table.py"))["keep"]
+    kept = tmp_path / "experiments"
+    keep(folder, kept)
+    first = json.loads((MADE_UP / "results.json").read_text())
+    assert json.loads((kept / "made-up" / "results.json").read_text()) == first
+    again, later = (
+        next(c for c in first["cells"] if (c["row"], c["seed"]) == place) for place in (("1:1", 24), ("1:9", 23))
+    )
+    cells = [again | {"mean_return": 501}, later | {"seed": 24}]
+    missing = [["1:1", "imitation", 25], ["1:9", "oracle", 25]]
+    changed(folder, cells=cells, failed=[], missing=missing, seeds=[24, 25])
+    (folder / "made.json").write_text(json.dumps([{"command": ["oodil", "table", "made-up", "--seeds", "24-25"]}]))
+    for _ in range(2):
+        keep(folder, kept)
+        records = read_table(kept / "made-up").records
+        assert [made["command"][-1] for made in records.made] == ["20-24", "24-25"]
+        assert records.seeds == (20, 21, 22, 23, 24, 25) and not records.failed
+        assert len(records.cells) == len(first["cells"]) + 1
+        assert [(c.seed, c.mean_return) for c in records.cells if (c.row, c.method) == ("1:1", "imitation")][-1] == (
+            24,
+            501,
+        )
+        assert [c.seed for c in records.cells if (c.row, c.method) == ("1:9", "imitation")] == [20, 21, 22, 23, 24]
+        assert records.missing == (
+            ("1:1", "imitation", 25), ("1:9", "naive_gail", 23), ("1:9", "naive_gail", 24), ("1:9", "oracle", 25)
+        )  # fmt: skip

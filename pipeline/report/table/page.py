@@ -69,7 +69,7 @@ class TablePage:
     rows: tuple[tuple[str, tuple[Shown, ...]], ...]
     panels: tuple[Panels, ...]
     grids: tuple[Grid, ...]
-    made: str
+    made: tuple[str, ...]
 
 
 def context(table: Table) -> TablePage:
@@ -115,7 +115,7 @@ def context(table: Table) -> TablePage:
             for plot in plots(table)
         ),
         grids=grids(table),
-        made=how_made(records.made),
+        made=tuple(how_made(each) for each in records.made),
     )
 
 

@@ -86,8 +86,8 @@ class Records(Held):
     """Row, method and seed of cells that are not there yet."""
     random_return: dict[str, float | None] = {}
     expert_return: dict[str, float | None] = {}
-    made: dict[str, Any] = {}
-    """How it was made; empty where that is not known."""
+    made: tuple[dict[str, Any], ...] = ()
+    """How it was made: what is known of each command that computed a part of it."""
 
     @model_validator(mode="after")
     def _one_cell_each(self) -> "Records":
@@ -110,8 +110,8 @@ class Records(Held):
 def read_records(folder: Path) -> Records:
     """Return the records of an experiment's folder. Raises DataError for a file that is not as described."""
     path = folder / RESULTS
-    values = _read(path)
-    made = _read(folder / MADE) if (folder / MADE).is_file() else {}
+    values = _read(path, dict)
+    made = _read(folder / MADE, list) if (folder / MADE).is_file() else []
     try:
         return Records.model_validate(values | {"made": made})
     except ValidationError as error:
@@ -120,13 +120,13 @@ def read_records(folder: Path) -> Records:
         raise DataError(f"{path}: {key + ': ' if key else ''}{first['msg'].removeprefix('Value error, ')}") from None
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path, kind: type[Any]) -> Any:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"{path}: {error.strerror or error}") from error
     except ValueError as error:
         raise DataError(f"{path}: not valid JSON: {error}") from error
-    if not isinstance(values, dict):
-        raise DataError(f"{path}: expected a mapping of keys, found {type(values).__name__}")
+    if not isinstance(values, kind):
+        raise DataError(f"{path}: expected a {kind.__name__}, found a {type(values).__name__}")
     return values

@@ -57,7 +57,7 @@ def explained(table: Table) -> str:
 
 
 def how_made(made: dict[str, Any]) -> str:
-    """Return one line on what is known of how the experiment was made; nothing where nothing is."""
+    """Return one line on what is known of a command that made a part of the table; nothing where nothing is."""
     parts = []
     for key, value in made.items():
         if key == "command" and isinstance(value, list):
@@ -101,8 +101,7 @@ def markdown(table: Table, level: int = 1, below: str = "") -> str:
     parts.append(lines(head, [(row, *(over_seeds(table, e) for e in _entries(table, row))) for row in records.rows]))
     for grid in grids(table):
         parts += [f"{heading}# {grid.title}", _escaped(grid.caption), grid_table(grid)]
-    made = how_made(records.made)
-    parts.append(f"Made with: {_escaped(made)}." if made else "")
+    parts += [f"Made with: {_escaped(how_made(each))}." for each in records.made]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
