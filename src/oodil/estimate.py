@@ -91,7 +91,7 @@ def outlook(table: Table, selected: dict[str, list[Stage]]) -> list[Outlook]:
     """Return what is left to do for the selected runs, in their order."""
     runs = {run.name: run for run in table.runs}
     found = [(RunResults(table.opened(run)), run.parts) for run in table.runs]
-    found += [(RunResults(read_run(table.folder.parent / path)), parts) for path, parts in table.beside().items()]
+    found += [(RunResults(read_run(table.folder.parent / path)), parts) for path, parts in table.beside.items()]
     done = {part for results, parts in found for stage, part in parts.items() if results.is_done(stage)}
     rates: dict[str, float] = {}
     taken: set[str] = set()

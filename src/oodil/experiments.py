@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -61,8 +62,9 @@ class Table:
         """Return a planned run as a run of its folder, whether or not it has begun."""
         return Run(run.config, RunDirectory(self.folder / run.name))
 
+    @cached_property
     def beside(self) -> dict[str, dict[str, str]]:
-        """Return what runs of the tables beside this one have in common with it, as parts by the run's path.
+        """What runs of the tables beside this one have in common with it, as parts by the run's path.
 
         Paths begin in the folder of all tables. Runs that cannot be read any more have nothing in common with it.
         """
@@ -129,7 +131,7 @@ class Table:
                 open_run(self.folder / name, configs[name])
             chosen = {name: [stage.name for stage in found] for name, found in selected.items()}
             parts = {run.name: run.parts for run in self.runs}
-            described = {"chosen": chosen, "parts": parts, "beside": self.beside()}
+            described = {"chosen": chosen, "parts": parts, "beside": self.beside}
             write_file(self.runner.path / _PLAN, encode_json(described))
             whole = Run(configs[next(iter(selected))], self.runner)
             write_file(self.runner.config, (whole.config.model_dump_json(indent=2) + "\n").encode())
