@@ -277,14 +277,18 @@ def _is_there(path: Path, origin: dict[str, Any], others: Sequence[Path]) -> boo
 
 
 class _Shown(Observer):
-    """Tells a job's context how far its run is, in environment steps."""
+    """Tells a job's context how far its run is, in environment steps of what was not finished when it began."""
 
     def __init__(self, run: Run, stages: Sequence[Stage], context: JobContext) -> None:
         self._run = run
         self._stages = {stage.name: stage for stage in stages}
         self._context = context
-        self._steps = {stage.name: max(stage.cost(run.config, 0.0).env_steps, LEAST_STEPS) for stage in stages}
-        self._total = sum(self._steps.values())
+        results = RunResults(run)
+        self._steps = {
+            stage.name: 0 if results.is_done(stage.name) else max(stage.cost(run.config, 0.0).env_steps, LEAST_STEPS)
+            for stage in stages
+        }
+        self._total = max(1, sum(self._steps.values()))
         self._behind = 0
         self._stage, self._jobs, self._ended = "", 1, 0
 

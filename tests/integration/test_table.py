@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 import oodil
-from oodil.experiments import Table
+from oodil.experiments import LEAST_STEPS, Table
 from oodil.pipeline.experiment import load_experiment
+from oodil.workers.local_engine import LocalEngine
+from oodil.workers.reports import Event, Progress
 from tests.runs import LiveRun, artifacts, has_checkpoint, interrupt, nothing_left, run, wait_for, without_baselines
 from tests.tables import RUNS, SHORT, write_experiment
 
@@ -102,6 +104,23 @@ def test_an_interrupt_stops_politely(whole: Path, tmp_path: Path) -> None:
     spent = {name: sum(oodil.open_run(tmp_path / "micro" / name).seconds().values()) for name in RUNS}
     said = {name: sum(each["seconds"].get(name, 0) for each in (interrupted, part, rest)) for name in RUNS}
     assert said == pytest.approx(spent, abs=0.2)
+
+
+def test_progress_is_that_of_what_is_left(tmp_path: Path) -> None:
+    """A run whose baseline is there begins at nothing done, and ends with as many steps as its other stages take."""
+    write_experiment(tmp_path, rows={"only": []}, seeds=0, published={})
+    table = Table.of(load_experiment(tmp_path / "experiment.yaml"), tmp_path / "micro")
+    for methods in (["naive_gail"], None):
+        events: list[Event] = []
+        selected = table.unfinished(table.select(None, methods))
+        left = [
+            stage for stage in selected["only-seed0"] if methods or stage.name not in ("demonstrations", "naive_gail")
+        ]
+        expected = sum(max(stage.cost(table.runs[0].config, 0).env_steps, LEAST_STEPS) for stage in left)
+        table.compute(selected, LocalEngine(0), events.append, lambda: False)
+        told = [event.report for event in events if isinstance(event.report, Progress)]
+        assert {each.total for each in told} == {expected} and told[-1].done == expected
+        assert [each.done for each in told] == sorted(each.done for each in told)
 
 
 def test_what_runs_have_in_common_is_computed_once(tmp_path: Path) -> None:
