@@ -85,7 +85,9 @@ def raw_rate() -> float:
 
 
 def machine() -> dict[str, Any]:
-    """Describe where the figures come from."""
+    """Describe where the figures come from; ``kernels`` are what the processor has torch compute with."""
+    import torch
+
     model = "unknown"
     if Path("/proc/cpuinfo").exists():
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -93,6 +95,7 @@ def machine() -> dict[str, Any]:
     return {
         "platform": platform.platform(),
         "cpu": model,
+        "kernels": torch.backends.cpu.get_cpu_capability(),
         "cores": os.cpu_count(),
         "load_average_before": os.getloadavg(),
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
