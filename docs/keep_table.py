@@ -44,7 +44,11 @@ def joined(kept: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
 
 
 def keep(table: Path, experiments: Path = EXPERIMENTS) -> None:
-    """Join the records of a table's folder with those of the same name that are kept."""
+    """Join the records of a table's folder with those of the same name that are kept.
+
+    Raises DataError, and keeps nothing, for records that are not as described.
+    """
+    read_table(table)
     found, made = (json.loads((table / name).read_bytes()) for name in (RESULTS, MADE))
     folder = experiments / found["experiment"]
     if folder.exists():
@@ -53,7 +57,6 @@ def keep(table: Path, experiments: Path = EXPERIMENTS) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RESULTS).write_bytes(encode_json(found, sort_keys=False))
     (folder / MADE).write_bytes(encode_json(made))
-    read_table(folder)
 
 
 def _place(cell: dict[str, Any]) -> tuple[str, str, int]:
@@ -65,7 +68,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tables", nargs="+", type=Path, metavar="TABLE", help="folder of a table, made by oodil table")
     for table in parser.parse_args().tables:
-        read_table(table)
         keep(table)
 
 

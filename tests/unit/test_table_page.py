@@ -324,30 +324,52 @@ def test_the_results_page_says_what_is_better_than_the_paper_and_what_is_not(fol
 
 
 def test_tables_of_several_machines_are_kept_together(folder: Path, tmp_path: Path):
-    """Ours of row 1:1 with seed 24 is made anew, row 1:9 gets a new seed; oracles of that row are not asked for."""
+    """In row 1:1 ours is made anew with seed 24 and the oracle gets another seed; row 1:9 was not asked for."""
     keep = runpy.run_path(str(ROOT / "docs" / "keep_table.py"))["keep"]
     kept = tmp_path / "experiments"
     keep(folder, kept)
     first = json.loads((MADE_UP / "results.json").read_text())
     assert json.loads((kept / "made-up" / "results.json").read_text()) == first
-    again, later = (
-        next(c for c in first["cells"] if (c["row"], c["seed"]) == place) for place in (("1:1", 24), ("1:9", 23))
-    )
-    cells = [again | {"mean_return": 501}, later | {"seed": 24}]
-    missing = [["1:1", "imitation", 25], ["1:9", "oracle", 25]]
+    places = ("1:1", "imitation", 24), ("1:1", "oracle", 24)
+    ours, oracle = (next(c for c in first["cells"] if (c["row"], c["method"], c["seed"]) == place) for place in places)
+    cells = [ours | {"mean_return": 501}, oracle | {"seed": 25}]
+    missing = [["1:1", "imitation", 25], ["1:9", "imitation", 25], ["1:9", "oracle", 24]]
     changed(folder, cells=cells, failed=[], missing=missing, seeds=[24, 25])
     (folder / "made.json").write_text(json.dumps([{"command": ["oodil", "table", "made-up", "--seeds", "24-25"]}]))
     for _ in range(2):
         keep(folder, kept)
-        records = read_table(kept / "made-up").records
-        assert [made["command"][-1] for made in records.made] == ["20-24", "24-25"]
-        assert records.seeds == (20, 21, 22, 23, 24, 25) and not records.failed
-        assert len(records.cells) == len(first["cells"]) + 1
-        assert [(c.seed, c.mean_return) for c in records.cells if (c.row, c.method) == ("1:1", "imitation")][-1] == (
-            24,
-            501,
+        joined = read_table(kept / "made-up")
+        assert [made["command"][-1] for made in joined.records.made] == ["20-24", "24-25"]
+        assert len(joined.records.cells) == len(first["cells"]) + 1
+        returns = joined.by_seed("1:1", "imitation", "mean_return")
+        assert returns == {20: 100, 21: 200, 22: 300, 23: 400, 24: 501}
+        assert list(joined.by_seed("1:1", "oracle", "mean_return")) == [20, 21, 22, 23, 24, 25]
+        assert [(each.row, each.method, each.seed) for each in joined.records.failed] == [("1:9", "imitation", 24)]
+        assert joined.records.missing == (
+            ("1:1", "imitation", 25),
+            ("1:9", "naive_gail", 23),
+            ("1:9", "naive_gail", 24),
         )
-        assert [c.seed for c in records.cells if (c.row, c.method) == ("1:9", "imitation")] == [20, 21, 22, 23, 24]
-        assert records.missing == (
-            ("1:1", "imitation", 25), ("1:9", "naive_gail", 23), ("1:9", "naive_gail", 24), ("1:9", "oracle", 25)
-        )  # fmt: skip
+
+
+def test_a_cell_that_had_failed_or_was_missing_is_kept_once_it_is_there(folder: Path, tmp_path: Path):
+    keep = runpy.run_path(str(ROOT / "docs" / "keep_table.py"))["keep"]
+    keep(folder, tmp_path / "experiments")
+    cells = json.loads((MADE_UP / "results.json").read_text())["cells"]
+    new = [
+        next(c for c in cells if (c["row"], c["method"]) == ("1:9", method)) | {"seed": 24}
+        for method in ("imitation", "naive_gail")
+    ]
+    changed(folder, cells=new, failed=[], missing=[])
+    keep(folder, tmp_path / "experiments")
+    joined = read_table(tmp_path / "experiments" / "made-up")
+    assert not joined.records.failed and joined.records.missing == (("1:9", "naive_gail", 23),)
+    assert len(joined.records.cells) == len(cells) + 2
+
+
+def test_records_that_are_not_as_described_are_not_kept(folder: Path, tmp_path: Path):
+    keep = runpy.run_path(str(ROOT / "docs" / "keep_table.py"))["keep"]
+    (folder / "made.json").write_text("{}")
+    with pytest.raises(DataError, match=r"made\.json: expected a list, found a dict"):
+        keep(folder, tmp_path / "experiments")
+    assert not (tmp_path / "experiments").exists()
