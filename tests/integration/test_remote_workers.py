@@ -1,6 +1,7 @@
 """Workers that join over TCP: the same bits, and nobody without an allowed key."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -91,21 +92,27 @@ def finished(run: Run, engine: LocalEngine) -> str:
     return run.job_artifact("learner", "waits").sha256
 
 
-def remote_worker(access: Access, keys: Path, logs: Path) -> subprocess.Popen[str]:
+def remote_worker(access: Access, keys: Path, said: Path) -> subprocess.Popen[bytes]:
+    """Return ``oodil worker`` once it serves, so that a signal finds its handler; what it says goes to a file."""
     command = [sys.executable, str(ROOT / "orchestrator.py"), "worker", "--connect", access.address]
-    command += ["--keys", str(keys), "--logs", str(logs)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    command += ["--keys", str(keys), "--logs", str(said.parent / "logs")]
+    with said.open("wb") as output:
+        remote = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
+    while "collects for" not in said.read_text():
+        assert remote.poll() is None, said.read_text()
+        time.sleep(0.1)
+    return remote
 
 
 @pytest.mark.parametrize("leaves", [False, True], ids=["stays", "is killed"])
 def test_a_worker_that_joins_from_elsewhere_changes_no_bit(access: Access, tmp_path: Path, leaves: bool) -> None:
-    """The job waits in its third iteration until the remote worker has collected, or is gone."""
+    """A remote worker is there before the run; if it leaves, the job waits in its third iteration until it is gone."""
     alone = fake_run(tmp_path / "alone")
     (alone.directory.path / "go").touch()
     expected = finished(alone, LocalEngine(1))
 
     keys = create_worker_keys(access.keys, "elsewhere", new_key_pair)
-    remote = remote_worker(access, keys, tmp_path / "logs")
+    remote = remote_worker(access, keys, tmp_path / "said")
     joined = fake_run(tmp_path / "joined")
 
     def go() -> bool:
@@ -121,19 +128,14 @@ def test_a_worker_that_joins_from_elsewhere_changes_no_bit(access: Access, tmp_p
     outcome = LocalEngine(1, access).run_jobs(stage, joined, ["waits"], lambda _: None, go)
     assert outcome.done == ["waits"], outcome
     assert joined.job_artifact("learner", "waits").sha256 == expected
-    if not leaves:
-        remote.terminate()
-        output, _ = remote.communicate(timeout=30)
-        assert remote.returncode == 0, output
-        assert "collects for" in output
-    else:
-        remote.communicate(timeout=30)
+    remote.terminate()
+    assert remote.wait(timeout=30) == (-signal.SIGKILL if leaves else 0), (tmp_path / "said").read_text()
 
 
 def test_remote_workers_alone_do_the_work(access: Access, tmp_path: Path) -> None:
     """The only local worker is stopped by the test, so the run can end only by what comes over TCP."""
     keys = create_worker_keys(access.keys, "elsewhere", new_key_pair)
-    remote = remote_worker(access, keys, tmp_path / "logs")
+    remote = remote_worker(access, keys, tmp_path / "said")
     run = fake_run(tmp_path / "run")
     (run.directory.path / "go").touch()
     from oodil.pipeline.collecting import InlineRollouts
@@ -151,7 +153,7 @@ def test_remote_workers_alone_do_the_work(access: Access, tmp_path: Path) -> Non
     finally:
         source.close()
         remote.terminate()
-        remote.communicate(timeout=30)
+        assert remote.wait(timeout=30) == 0, (tmp_path / "said").read_text()
 
 
 def refused(*arguments: str) -> str:
@@ -199,11 +201,12 @@ def test_a_worker_with_other_libraries_ends_with_the_reason(
     from oodil.workers import zmq_rollouts
 
     monkeypatch.setattr(zmq_rollouts, "collecting_versions", lambda: "mujoco 0.0.0")
-    remote = remote_worker(access, create_worker_keys(access.keys, "elsewhere", new_key_pair), tmp_path / "logs")
+    remote = remote_worker(access, create_worker_keys(access.keys, "elsewhere", new_key_pair), tmp_path / "said")
     source = zmq_rollouts.ZmqRollouts(f"ipc://{tmp_path}/s", "a run", "learner.1", 60.0, access=access)
     try:
-        output, _ = remote.communicate(timeout=30)
-        assert remote.returncode == 1 and "refused: this worker has" in output and "mujoco 0.0.0" in output
+        assert remote.wait(timeout=30) == 1
+        output = (tmp_path / "said").read_text()
+        assert "refused: this worker has" in output and "mujoco 0.0.0" in output
     finally:
         source.close()
         remote.kill()
