@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 import oodil
-from oodil.experiments import LEAST_STEPS, Table
+from oodil.experiments import Table
 from oodil.pipeline.experiment import load_experiment
+from oodil.whole_runs import LEAST_STEPS
 from oodil.workers.local_engine import LocalEngine
 from oodil.workers.reports import Event, Progress
 from tests.runs import LiveRun, artifacts, has_checkpoint, interrupt, nothing_left, run, wait_for, without_baselines

@@ -25,7 +25,7 @@ UNSAFE_MODULES = {
 }
 UNSAFE_CALLS = {"torch.load", "torch.save", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "np.load", "numpy.load"}
 UNSAFE_METHODS = {"send_pyobj", "recv_pyobj"}
-COMMAND_LINE = ("cli", "terminal", "bench", "experiments", "estimate")
+COMMAND_LINE = ("cli", "terminal", "bench", "experiments", "whole_runs", "estimate")
 TOP = ("orchestrator", *COMMAND_LINE)
 BOTTOM = {
     "errors": (),

@@ -8,11 +8,12 @@ import pytest
 import yaml
 
 from oodil.estimate import outlook
-from oodil.experiments import Table, _without_what_follows
+from oodil.experiments import Table
 from oodil.pipeline.environments.goals import reached_goal
 from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.experiment import ExperimentConfig, labels, load_experiment, plan
 from oodil.pipeline.loading import shipped_configs, shipped_experiments
+from oodil.whole_runs import _without_what_follows
 from tests.runs import MICRO
 
 VALUES: dict[str, Any] = {
