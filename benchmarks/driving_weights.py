@@ -21,7 +21,8 @@ import oodil
 from oodil.pipeline.config import EnvironmentConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import make_batch
-from oodil.pipeline.environments.driving import STEP_REWARD, WIDTH, Layout, positions, touches
+from oodil.pipeline.environments.driving import STEP_REWARD
+from oodil.pipeline.environments.driving_world import WIDTH, Layout, positions, touches
 from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.report.paths import sheet, world_of
 from oodil.pipeline.results import Transferability

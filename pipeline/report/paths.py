@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from oodil.pipeline.config import EnvironmentConfig
 from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.environments.driving import GOAL, HEIGHT, WIDTH, Box, DrivingEnv, Layout, positions
+from oodil.pipeline.environments.driving import DrivingEnv
+from oodil.pipeline.environments.driving_world import GOAL, HEIGHT, WIDTH, Box, Layout, positions
 from oodil.pipeline.report.canvas import drawing
 from oodil.pipeline.report.looks import MUTED, NOT_TRANSFERABLE, TRANSFERABLE, Look
 

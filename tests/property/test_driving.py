@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from oodil.pipeline.environments import make_batch
-from oodil.pipeline.environments.driving import GOAL, DrivingBatch, DrivingEnv, layout, observe, touches
+from oodil.pipeline.environments.driving import DrivingBatch, DrivingEnv
+from oodil.pipeline.environments.driving_world import GOAL, layout, observe, touches
 from oodil.pipeline.errors import OodilError
 from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.seeding import numpy_rng

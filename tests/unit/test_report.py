@@ -15,7 +15,7 @@ from oodil.pipeline import stage as stage_module
 from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations, Episode
-from oodil.pipeline.environments.driving import layout
+from oodil.pipeline.environments.driving_world import layout
 from oodil.pipeline.errors import StorageError
 from oodil.pipeline.loading import parse_config
 from oodil.pipeline.metrics import Metrics
