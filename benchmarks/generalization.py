@@ -78,7 +78,8 @@ def main() -> None:
         write_file(recorded, encode_demonstrations(later(collected), config.environment.id))
         scored = oodil.score(base, recorded)
         found: dict[str, Any] = {"before": base.evaluation().mean_return, "frozen": frozen(scored, config)}
-        found |= {"refused": scored.refused, "finetuned": {}}
+        titles = {each.name: each.title for each in base.weightings if each.name in scored.found}
+        found |= {"titles": titles, "refused": scored.refused, "finetuned": {}}
         seeds[str(seed)] = found
         for name, line in found["frozen"].items():
             print(seed, name, {key: round(line[key], 3) for key in ("auroc", "share_before", "share")}, flush=True)

@@ -9,10 +9,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from measured import EXPERIMENTS
+
 from oodil.pipeline.artifacts import MADE, RESULTS, encode_json
 from oodil.pipeline.report.table import read_table
-
-EXPERIMENTS = Path(__file__).parents[1] / "benchmarks" / "results" / "experiments"
 
 
 def joined(kept: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
