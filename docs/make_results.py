@@ -18,6 +18,7 @@ from oodil.pipeline.report.table.figures import plots
 from oodil.pipeline.report.table.grids import findings
 from oodil.pipeline.report.table.summary import Entry
 from oodil.pipeline.report.table.texts import lines, markdown, mean, over_seeds
+from oodil.pipeline.statistics import ENOUGH_SEEDS
 
 ROOT = Path(__file__).parents[1]
 PAGE, FIGURES, README = ROOT / "docs" / "results.md", ROOT / "docs" / "results", ROOT / "README.md"
@@ -90,20 +91,22 @@ def summary(held: dict[str, Table]) -> Iterator[str]:
 def readme(text: str, folder: Path = EXPERIMENTS) -> str:
     """Return the README with the committed results in it, or as it is while there are none.
 
-    It has those rows of each experiment that have the most seeds, if ours and naive GAIL are among its methods.
+    It has the rows in which ours and naive GAIL have enough seeds to be compared.
     """
     rows = []
     for table in tables(folder).values():
         if not {table.ours, NAIVE} <= set(table.records.methods):
             continue
         where = f"[{table.records.caption.partition(',')[0]}](docs/results.md#{anchor(table)})"
-        seeds = {row: len(table.entries[row, table.ours].by_seed) for row in table.records.rows}
-        for row in [row for row, count in seeds.items() if count and count == max(seeds.values())]:
+        for row in table.records.rows:
             each = [table.entries[row, method] for method in (table.ours, NAIVE)]
+            if any(len(entry.by_seed) < ENOUGH_SEEDS for entry in each):
+                continue
             best = table.measure.best(*(entry.found.mean for entry in each if entry.found))
             shares = [table.by_seed(row, table.ours, figure).values() for figure in ("share_before", "share_after")]
             told = " -> ".join(formats.percent(sum(share) / len(share)) for share in shares if share) or formats.UNKNOWN
-            rows.append((f"{where}, {row}", str(seeds[row]), *(cell(table, entry, best) for entry in each), told))
+            seeds = str(len(each[0].by_seed))
+            rows.append((f"{where}, {row}", seeds, *(cell(table, entry, best) for entry in each), told))
     if not rows:
         return text
     head = ("environment and row", "seeds", "ours", "naive GAIL", "share before -> after")
