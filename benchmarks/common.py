@@ -5,7 +5,6 @@ everything in a ``main`` behind a guard, because processes that it spawns import
 """
 
 import argparse
-import json
 import math
 import os
 import sys
@@ -16,7 +15,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from oodil.bench import machine
-from oodil.pipeline.artifacts import Checkpoints
+from oodil.pipeline.artifacts import Checkpoints, encode_json
 from oodil.pipeline.collecting import InlineRollouts, RolloutSource
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.loading import parse_config
@@ -59,7 +58,7 @@ def save(path: Path | None, found: dict[str, Any]) -> None:
     if path is not None:
         found["machine"]["load_average_after"] = os.getloadavg()
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(found, indent=1) + "\n")
+        path.write_bytes(encode_json(found, sort_keys=False))
 
 
 class Quiet:

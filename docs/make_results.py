@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from measured import EXPERIMENTS, alone, choice, controls, paths, speed
+from measured import EXPERIMENTS, alone, choice, controls, later, later_curves, paths, speed
 
 from oodil.pipeline.report import formats
 from oodil.pipeline.report.table import Table, read_table
@@ -48,7 +48,7 @@ def page(folder: Path = EXPERIMENTS) -> str:
         notes = folder / name / "notes.md"
         reasons = f"### Why\n\n{notes.read_text(encoding='utf-8').strip()}" if notes.is_file() else ""
         parts.append(markdown(table, level=2, below="\n\n".join(part for part in (pictures, reasons) if part)).strip())
-    parts += [alone(), paths(), controls(), choice(), speed()]
+    parts += [alone(), paths(), later(), controls(), choice(), speed()]
     return "\n\n".join(parts) + "\n"
 
 
@@ -128,9 +128,10 @@ def anchor(table: Table) -> str:
 
 def figures(folder: Path = EXPERIMENTS) -> dict[str, str]:
     """Return all figures in SVG by the names of their files."""
-    return {
+    drawn = {
         f"{name}-{plot.name}.svg": plot.sheet(table) for name, table in tables(folder).items() for plot in plots(table)
     }
+    return drawn | {"later-curves.svg": later_curves()}
 
 
 def main() -> None:

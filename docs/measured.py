@@ -5,7 +5,11 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
+from matplotlib.ticker import FuncFormatter
+
 from oodil.pipeline.report import formats
+from oodil.pipeline.report.canvas import drawing, steps_axis, tick
+from oodil.pipeline.report.looks import INK, MUTED, POLICIES
 from oodil.pipeline.report.table.texts import lines
 
 MEASURED = Path(__file__).parents[1] / "benchmarks" / "results"
@@ -72,6 +76,69 @@ Runs, and how many of their {measured["runs"][0]["paths"]} paths can be reproduc
 
 Paths of {measured["runs"][-1]["run"]}: dark is the heaviest of a row, pale has no weight, orange are the imitator's
 obstacles and green is the goal. *marks* are those of the configuration, which leave the second source out."""
+
+
+def later() -> str:
+    """Return what is made of demonstrations that come after a run: by its frozen weightings, and by fine-tuning."""
+    file = "generalization.json"
+    measured = json.loads((MEASURED / file).read_text())
+    runs = measured["seeds"].values()
+    weightings, sources = [], []
+    for name, title in _titles(measured).items():
+        frozen = [run["frozen"][name] for run in runs if name in run["frozen"]]
+        by_source = [each for line in frozen for each in line["verdicts"]["by_source"]]
+        tuned = [run["finetuned"][name]["mean_return"] for run in runs if name in run["finetuned"]]
+        shares = (formats.percent(fmean(each[key] for each in frozen)) for key in ("share_before", "share"))
+        told = (f"{fmean(each['auroc'] for each in frozen):.3f}", " → ".join(shares))
+        if all(each["unlike"] == each["demonstrations"] for each in by_source):
+            told = ("all unlike", formats.UNKNOWN)
+        reached = f"{fmean(tuned):,.0f} ({', '.join(f'{each:,.0f}' for each in tuned)})" if tuned else formats.UNKNOWN
+        weightings.append((title, *told, reached))
+    for seed, run in measured["seeds"].items():
+        for each in run["frozen"]["transferability"]["verdicts"]["by_source"]:
+            verdicts = (str(each[key]) for key in ("demonstrations", "kept", "open", "unlike"))
+            score = f"{each['score']:.3f} [{each['low']:.3f}, {each['high']:.3f}]" if each["score"] else formats.UNKNOWN
+            sources.append((seed, each["name"], *verdicts, score))
+    before = ", ".join(f"{run['before']:,.0f}" for run in runs)
+    head = ("weighting", "AUROC", "share before → after", "fine-tuned: mean return (seeds)")
+    return f"""## Demonstrations that come later
+
+Walker2d, as the paper's C.5: runs of [figure4a](#figure4a), then 10, 50 and 50 demonstrations of frictions 24.9, 0.7
+and 0.1, of which the first can be reproduced. Their scores by what each weighting of the run had learned, frozen;
+then our policy, of {before} before, goes on with all of them, weighed by each in turn. Seeds
+{", ".join(measured["seeds"])}. {_made(file, measured)}
+
+{lines(head, weightings, escape=False)}
+
+What ours says of the later ones:
+
+{lines(("seed", "source", "demonstrations", "kept", "open", "unlike", "score and interval"), sources, escape=False)}
+
+![Learning curves of our policy on all demonstrations, by weighting](results/later-curves.svg)"""
+
+
+def later_curves() -> str:
+    """Return how our policy goes on by each weighting, a line for each seed, as an SVG image."""
+    measured = json.loads((MEASURED / "generalization.json").read_text())
+    with drawing("later-curves", 6.4, 3.2) as (figure, svg):
+        figure.set_facecolor("white")
+        axes = figure.subplots()
+        for (name, title), color in zip(_titles(measured).items(), POLICIES, strict=False):
+            label = title
+            for run in measured["seeds"].values():
+                if name in run["finetuned"]:
+                    curve = run["finetuned"][name]["curve"]
+                    width = 2.2 if color == INK else 1.5
+                    axes.plot(curve["env_steps"], curve["mean_return"], color=color, linewidth=width, label=label)
+                    label = "_another seed"
+        for run in measured["seeds"].values():
+            axes.axhline(run["before"], color=MUTED, linestyle="dotted", linewidth=1)
+        axes.set(xlabel="environment steps of the fine-tuning", ylabel="return")
+        axes.set_xlim(left=0)
+        steps_axis(axes, 5)
+        axes.yaxis.set_major_formatter(FuncFormatter(tick))
+        figure.legend(loc="outside right upper", frameon=False)
+    return svg.getvalue()
 
 
 def controls() -> str:
@@ -141,3 +208,8 @@ def _made(file: str, measured: dict[str, Any]) -> str:
     raw = measured.get("raw_hopper_steps_per_s")
     rate = f", raw Hopper `mj_step` {raw:,.0f} a second and core beside other work" if raw else ""
     return f"From [{file}](../benchmarks/results/{file}); {measured['machine']['time'][:10]}{rate}."
+
+
+def _titles(measured: dict[str, Any]) -> dict[str, str]:
+    """Return what each weighting of any seed is called, by name."""
+    return {name: title for run in measured["seeds"].values() for name, title in run["titles"].items()}
