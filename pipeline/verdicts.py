@@ -16,7 +16,7 @@ from oodil.pipeline.results import Transferability
 MEANING = "1: cannot be told from the imitator's own fresh episodes; 0: nothing of it is reproduced"
 """What a score of a weighting that trains imitators says."""
 LITTLE = 0.02
-"""Below it, nothing is reproduced well. The threshold cannot say so: it is relative to the best cluster, so that
+"""Below it, nothing is reproduced well. The threshold cannot say so: it is relative to the best mode, so that
 something is kept even where nothing can be reproduced. At a score of 0.02, D = 0.99: whoever looks at a demonstration
 and at the imitator, and is wrong in one of twenty cases, calls them different, by the usual measure of doubt."""
 

@@ -31,6 +31,16 @@ def share_lasted(demonstrations: Demonstrations, horizon: int) -> Array:
     return np.where(demonstrations.terminated, lasted, 1.0)
 
 
+def best_mode(readings: Array, share: float) -> float:
+    """Return what the best demonstrations of a cluster score: those that reach ``share`` of its highest score.
+
+    It is the mean of their (R, N) readings. A cluster may hold another mode as well, which its imitator reproduces
+    less; the mean of all would say how many of those there are.
+    """
+    scores = readings.mean(axis=0)
+    return float(readings[:, scores >= share * scores.max()].mean())
+
+
 def kept_weights(scores: Array, intervals: Array, threshold: float) -> Array:
     """Return (N,) weights that sum to one: the scores of those whose whole interval (N, 2) reaches the threshold.
 

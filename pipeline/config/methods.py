@@ -45,8 +45,9 @@ class TransferabilityConfig(Section):
     """Trainings of each cluster's imitator, each with a seed of its own; the one whose transitions come closest to the
     cluster's counts."""
     kept_from: UnitInterval = 0.5
-    """A demonstration is kept if its score is at least this share of the best cluster's; with 0 everything is kept, and
-    weighs in proportion to its score (the paper's Eqn 7)."""
+    """A demonstration is kept if its score is at least this share of the best mode's: of the mean over those of a
+    cluster that reach the same share of its highest. With 0 everything is kept, and weighs in proportion to its score
+    (the paper's Eqn 7)."""
 
     @model_validator(mode="before")
     @classmethod

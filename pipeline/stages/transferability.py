@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oodil.pipeline.algorithms.weights import intervals, kept_weights, share_lasted, transferability_of_divergences
+from oodil.pipeline.algorithms.weights import (
+    best_mode,
+    intervals,
+    kept_weights,
+    share_lasted,
+    transferability_of_divergences,
+)
 from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
@@ -40,7 +46,7 @@ class TransferabilityStage(Weighting):
 
     name = "transferability"
     title = "ours"
-    version = 3
+    version = 4
     inputs = ("demonstrations", "clustering", "imitators")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
@@ -60,7 +66,7 @@ class TransferabilityStage(Weighting):
         share = config.transferability.kept_from
         if share == 0:
             return super().rule(config)
-        return f"{super().rule(config)}, if the whole interval reaches {share:.0%} of the best cluster's score"
+        return f"{super().rule(config)}, if the whole interval reaches {share:.0%} of the best mode's score"
 
     def weights(self, found: Transferability) -> NDArray[np.float64]:
         """Return (N,) weights of scores and intervals, of those that are kept."""
@@ -114,7 +120,7 @@ class TransferabilityStage(Weighting):
             history[cluster] = ScoreHistory.load(run.job_artifact(ImitatorsStage.name, job))
         labels = load_assignment(run).labels
         readings = self._readings(run.config, demonstrations, divergences)
-        best = max(float(readings[:, labels == cluster].mean()) for cluster in history)
+        best = max(best_mode(readings[:, labels == cluster], section.kept_from) for cluster in history)
         found = self._judged(run.config, readings, labels, section.kept_from * best)
         if fresh:
             found.intervals[np.bincount(labels)[labels] == 1] = 0, 1  # Its readers have seen it, and there is no other.

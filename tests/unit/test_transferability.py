@@ -8,6 +8,7 @@ import torch
 
 from oodil.pipeline.algorithms.discriminator import Discriminator, mean_logit_per_demonstration
 from oodil.pipeline.algorithms.weights import (
+    best_mode,
     effective_number,
     intervals,
     kept_weights,
@@ -50,6 +51,14 @@ def test_weights_are_the_scores_of_what_surely_reaches_the_threshold():
     np.testing.assert_allclose(kept_weights(scores, limits, 0.4), [1, 0, 0, 0])
     np.testing.assert_allclose(kept_weights(scores, limits, 0.6), [0.6 / 1.1, 0, 0.5 / 1.1, 0], err_msg="all open")
     np.testing.assert_allclose(kept_weights(scores, limits, 0.9), [0.25] * 4)
+
+
+@pytest.mark.parametrize("others", [0, 1, 500])
+def test_what_the_best_of_a_cluster_score_does_not_depend_on_how_many_others_it_holds(others: int):
+    best, worse = np.array([[0.3, 0.2, 0.1], [0.5, 0.2, 0.3]]), np.tile([[0.09], [0.01]], others)
+    readings = np.concatenate((best, worse), axis=1)
+    assert best_mode(readings, 0.5) == pytest.approx((0.4 + 0.2 + 0.2) / 3)
+    assert best_mode(readings, 0.0) == pytest.approx((0.8 + 0.05 * others) / (3 + others))
 
 
 def test_an_interval_is_two_errors_around_the_mean_and_everything_with_one_reading():
