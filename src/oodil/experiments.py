@@ -138,7 +138,8 @@ class Table:
     def write_made(self, command: Sequence[str]) -> Path:
         """Add to how it was made: by which command, on what machine, how fast; return the file.
 
-        Seconds are of the stages that were finished since the last command that is there.
+        Seconds are of the stages that were finished since the last command that is there. One that finished none is
+        left out.
         """
         path = self.folder / MADE
         earlier = json.loads(path.read_bytes()) if path.exists() else []
@@ -146,13 +147,16 @@ class Table:
         for each in earlier:
             for name, seconds in each["seconds"].items():
                 spent[name] = spent.get(name, 0) - seconds
+        seconds = {name: round(each, 1) for name, each in spent.items() if each > SHORTEST_S}
+        if earlier and not seconds:
+            return path
         circumstances = {
             # Nobody else has these folders.
             "command": ["oodil", *(Path(each).name if Path(each).is_absolute() else each for each in command)],
             "machine": machine(),
             "raw_hopper_steps_per_s": raw_rate(),
             "versions": library_versions(),
-            "seconds": {name: round(seconds, 1) for name, seconds in spent.items() if seconds > SHORTEST_S},
+            "seconds": seconds,
         }
         write_file(path, encode_json([*earlier, circumstances]))
         return path

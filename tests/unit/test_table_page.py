@@ -373,3 +373,10 @@ def test_records_that_are_not_as_described_are_not_kept(folder: Path, tmp_path: 
     with pytest.raises(DataError, match=r"made\.json: expected a list, found a dict"):
         keep(folder, tmp_path / "experiments")
     assert not (tmp_path / "experiments").exists()
+
+
+def test_a_single_seed_is_better_than_nobody(folder: Path):
+    cells = [each for each in json.loads((folder / "results.json").read_text())["cells"] if each["seed"] == 20]
+    assert not any(
+        "deviation" in each for each in findings(changed(folder, cells=cells, seeds=[20], missing=[], failed=[]))
+    )
