@@ -79,7 +79,8 @@ def main() -> None:
         scored = oodil.score(base, recorded)
         found: dict[str, Any] = {"before": base.evaluation().mean_return, "frozen": frozen(scored, config)}
         titles = {each.name: each.title for each in base.weightings if each.name in scored.found}
-        found |= {"titles": titles, "refused": scored.refused, "finetuned": {}}
+        refused = {name: reason.removeprefix(f"{base.path}: ") for name, reason in scored.refused.items()}
+        found |= {"titles": titles, "refused": refused, "finetuned": {}}
         seeds[str(seed)] = found
         for name, line in found["frozen"].items():
             print(seed, name, {key: round(line[key], 3) for key in ("auroc", "share_before", "share")}, flush=True)

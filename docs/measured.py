@@ -86,16 +86,17 @@ def later() -> str:
     weightings, sources = [], []
     for name, title in _titles(measured).items():
         frozen = [run["frozen"][name] for run in runs if name in run["frozen"]]
-        by_source = [each for line in frozen for each in line["verdicts"]["by_source"]]
+        # Without a score all weigh the same, which says nothing.
+        frozen = [run for run in frozen if any(each["unlike"] < each["demonstrations"] for each in _by_source(run))]
         tuned = [run["finetuned"][name]["mean_return"] for run in runs if name in run["finetuned"]]
-        shares = (formats.percent(fmean(each[key] for each in frozen)) for key in ("share_before", "share"))
-        told = (f"{fmean(each['auroc'] for each in frozen):.3f}", " → ".join(shares))
-        if all(each["unlike"] == each["demonstrations"] for each in by_source):
-            told = ("all unlike", formats.UNKNOWN)
+        told = ("all unlike", formats.UNKNOWN)
+        if frozen:
+            shares = (formats.percent(fmean(each[key] for each in frozen)) for key in ("share_before", "share"))
+            told = (f"{fmean(each['auroc'] for each in frozen):.3f}", " → ".join(shares))
         reached = f"{fmean(tuned):,.0f} ({', '.join(f'{each:,.0f}' for each in tuned)})" if tuned else formats.UNKNOWN
         weightings.append((title, *told, reached))
     for seed, run in measured["seeds"].items():
-        for each in run["frozen"]["transferability"]["verdicts"]["by_source"]:
+        for each in _by_source(run["frozen"]["transferability"]):
             verdicts = (str(each[key]) for key in ("demonstrations", "kept", "open", "unlike"))
             score = f"{each['score']:.3f} [{each['low']:.3f}, {each['high']:.3f}]" if each["score"] else formats.UNKNOWN
             sources.append((seed, each["name"], *verdicts, score))
@@ -208,6 +209,12 @@ def _made(file: str, measured: dict[str, Any]) -> str:
     raw = measured.get("raw_hopper_steps_per_s")
     rate = f", raw Hopper `mj_step` {raw:,.0f} a second and core beside other work" if raw else ""
     return f"From [{file}](../benchmarks/results/{file}); {measured['machine']['time'][:10]}{rate}."
+
+
+def _by_source(frozen: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the verdicts of a frozen weighting, a line for each source."""
+    found: list[dict[str, Any]] = frozen["verdicts"]["by_source"]
+    return found
 
 
 def _titles(measured: dict[str, Any]) -> dict[str, str]:

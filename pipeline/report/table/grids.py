@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from oodil.pipeline.report import formats
-from oodil.pipeline.report.table.summary import MEASURES, ORACLE, Entry, Measure, Table
+from oodil.pipeline.report.table.summary import MEASURES, ORACLE, Measure, Table
 from oodil.pipeline.statistics import COVERED, ENOUGH_SEEDS
 
 ASIDE = "mean_return", "share_reached", "auroc", "effective_number", "purity", "clusters_used", "distance", "env_steps"
@@ -174,9 +174,12 @@ def findings(table: Table) -> Iterator[str]:
         below = [entry for entry in against if table.marked[entry.row, table.ours] == "published"]
         yield _counted(f"“{title}” is at or above the paper", len(against), [entry.row for entry in below], "Below it")
     others = [method for method in records.methods if method not in (table.ours, ORACLE)]
-    compared = [
-        row for row in records.rows if _deviates(ours[row]) and any(_deviates(table.entries[row, m]) for m in others)
-    ]
+    compared = []
+    for row in records.rows:
+        theirs = [found for method in others if (found := table.entries[row, method].found)]
+        mine = ours[row].found
+        if mine and theirs and np.isfinite([each.deviation for each in (mine, *theirs)]).all():
+            compared.append(row)
     if compared:
         close = {row: [records.methods[m] for m in others if not _beyond(table, row, m)] for row in compared}
         what = f"“{title}” is better than every other column but the oracle by more than the deviation over seeds"
@@ -186,17 +189,12 @@ def findings(table: Table) -> Iterator[str]:
 
 
 def _beyond(table: Table, row: str, method: str) -> bool:
-    """Return whether ours is better by more than the larger of two deviations than a method that has one, if it has."""
+    """Return whether ours is better than a method by more than the larger of their two deviations."""
     ours, theirs = (table.entries[row, name].found for name in (table.ours, method))
-    if ours is None or theirs is None or not _deviates(table.entries[row, method]):
+    if ours is None or theirs is None:
         return True
     better = ours.mean - theirs.mean if table.measure.higher_is_better else theirs.mean - ours.mean
     return better > max(ours.deviation, theirs.deviation)
-
-
-def _deviates(entry: Entry) -> bool:
-    """Return whether there are seeds enough for a deviation."""
-    return entry.found is not None and bool(np.isfinite(entry.found.deviation))
 
 
 def _counted(what: str, total: int, exceptions: list[str], lead: str) -> str:
