@@ -1,11 +1,11 @@
 """Phase 1 of the method: contrastive clustering (Algorithm 1 of the appendix), or k-means of states (appendix C.6).
 
 The encoder is trained first by the contrastive loss alone, then together with K centers that follow their members as
-running means. Unlike the paper, the counters of these means start above zero, as in the official code, centers stay on
-the unit sphere, and a demonstration is represented, when centers are initialized and when it is labeled, by the mean
-feature of several sub-trajectories. The warm-up is skipped where the sub-trajectories of a demonstration agree on its
-cluster without it: it would only spread demonstrations evenly over the sphere and close the gap around a small mode
-(docs/decisions.md).
+running means. Unlike the paper, centers may begin at the groups of average linkage, the counters of their means start
+above zero, as in the official code, centers stay on the unit sphere, and a demonstration is represented, when centers
+are initialized and when it is labeled, by the mean feature of several sub-trajectories. The warm-up is skipped where
+the sub-trajectories of a demonstration agree on its cluster without it: it would only spread demonstrations evenly over
+the sphere and close the gap around a small mode (docs/decisions.md).
 
 Letters: N demonstrations, B batch, l states of a sub-trajectory, S observation, E embedding, K clusters.
 """
@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.cluster import KMeans
+from sklearn.cluster import AgglomerativeClustering, KMeans
+from sklearn.metrics import silhouette_score
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -29,6 +30,8 @@ from oodil.pipeline.seeding import Key, derive_key, numpy_rng, torch_seed
 
 ENCODED_AT_ONCE = 1024
 """Sub-trajectories per forward pass outside training; a limit on memory."""
+COMPARED_AT_ONCE = 5000
+"""Demonstrations by which centers are initialized; of more, some are drawn: linkage compares all pairs."""
 
 
 def assign(features: Tensor, centers: Tensor) -> Tensor:
@@ -205,13 +208,15 @@ class ContrastiveClustering:
 
     @torch.no_grad()
     def _initial_centers(self) -> tuple[Tensor, float]:
-        """Return (K, E) features of K random demonstrations, or the k-means of all, and the stability of labels."""
+        """Return (K, E) centers, by k-means, by linkage or of K random demonstrations, and the stability of labels."""
         config = self.config
         rng = numpy_rng(self._key("centres"))
         features = _encode_all(self.encoder, self._subtrajectories, config.label_draws, self._key("centres", "views"))
         mean = self.encoder.of_demonstrations(features)
         if config.initial_centers == "trajectories":
             centers = features[0, rng.permutation(len(mean))[: config.num_clusters]]
+        elif config.initial_centers == "silhouette":
+            centers = best_centers(mean, config.num_clusters, rng)
         else:
             centers, _ = _kmeans(mean, config.num_clusters, rng)
         if config.normalize_centers:
@@ -237,6 +242,27 @@ def clusters_of_states(demonstrations: Demonstrations, config: ClusteringConfig,
     rng = numpy_rng(derive_key(root_seed, "clustering", "states"))
     centers, labels = _kmeans(features, config.num_clusters, rng)
     return _model(encoder, centers, labels.bincount(minlength=config.num_clusters), subtrajectories)
+
+
+def best_centers(features: Tensor, num_clusters: int, rng: np.random.Generator) -> Tensor:
+    """Return (K, E) centers of (N, E) unit features, by k-means or linkage: those with the greater silhouette.
+
+    The squared distances of k-means would rather divide a large, wide mode once more than tell a rare one from it.
+    Average linkage goes by the distance between groups, whatever their size, but spends groups on outliers.
+    """
+    by_kmeans, _ = _kmeans(features, num_clusters, rng)
+    drawn = features[rng.permutation(len(features))[:COMPARED_AT_ONCE]]
+    if not 1 < num_clusters < len(drawn):
+        return by_kmeans
+    groups = AgglomerativeClustering(num_clusters, linkage="average").fit_predict(drawn.numpy())
+    by_linkage = torch.stack([drawn[groups == k].mean(0) for k in range(num_clusters)])
+    return max((by_kmeans, by_linkage), key=lambda centers: _silhouette(drawn, normalize(centers, dim=-1)))
+
+
+def _silhouette(features: Tensor, centers: Tensor) -> float:
+    """Return the mean silhouette by cosine of (N, E) features in the groups of (K, E) centers; -1 for one group."""
+    labels = assign(features, centers).numpy()
+    return float(silhouette_score(features.numpy(), labels, metric="cosine")) if len(set(labels)) > 1 else -1.0
 
 
 def _kmeans(features: Tensor, num_clusters: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:

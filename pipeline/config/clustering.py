@@ -41,8 +41,9 @@ class ClusteringConfig(Section):
     """Iterations with both losses."""
     batch_size: PositiveInt = 128
     """Demonstrations per iteration; all of them if there are fewer."""
-    initial_centers: Literal["trajectories", "kmeans"] = "kmeans"
-    """K random demonstrations (appendix) or k-means of all (official code)."""
+    initial_centers: Literal["silhouette", "trajectories", "kmeans"] = "silhouette"
+    """K-means or average linkage, whichever has the greater silhouette, K random demonstrations (appendix), or k-means
+    (official code)."""
     initial_count: PositiveInt = 100
     """Counter at which each center's running mean starts."""
     update_order: Literal["step_first", "centers_first"] = "step_first"
@@ -80,6 +81,7 @@ CLUSTERING_PRESETS: dict[str, dict[str, Any]] = {
         "weight_decay": 1e-6,
         "sufficient_stability": None,
         "joint_iterations": 1800,
+        "initial_centers": "kmeans",
         "update_order": "centers_first",
         "normalize_centers": False,
         "standardize_states": False,

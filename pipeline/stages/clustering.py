@@ -28,7 +28,7 @@ class ClusteringStage(Stage):
     """Clustering of whole demonstrations (`oodil.pipeline.algorithms.clustering`)."""
 
     name = "clustering"
-    version = 2
+    version = 3
     inputs = ("demonstrations",)
 
     def settings(self, config: RunConfig) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from sklearn.cluster import KMeans
+from sklearn.cluster import AgglomerativeClustering, KMeans
 from sklearn.metrics import calinski_harabasz_score, silhouette_score
 
 from oodil.pipeline.algorithms.clustering import (
@@ -15,6 +15,7 @@ from oodil.pipeline.algorithms.clustering import (
     ContrastiveClustering,
     Labeling,
     assign,
+    best_centers,
     center_loss,
     clusters_of_states,
     moved_centers,
@@ -112,6 +113,44 @@ def test_three_dynamics_are_told_apart_with_five_clusters():
     assert (owner[found.labels] == new.sources).mean() > 0.9
 
 
+def on_a_circle(*angles: np.ndarray) -> tuple[torch.Tensor, np.ndarray]:
+    """Return unit features and the mode of each: one for every array of angles."""
+    every = np.concatenate(angles)
+    features = np.stack((np.cos(every), np.sin(every)), axis=1).astype(np.float32)
+    return torch.from_numpy(features), np.repeat(np.arange(len(angles)), [len(each) for each in angles])
+
+
+def is_alone(mode: int, modes: np.ndarray, labels: np.ndarray) -> bool:
+    """Return whether a mode has a cluster of its own, and one only."""
+    mine = np.unique(labels[modes == mode])
+    return len(mine) == 1 and bool((modes[labels == mine[0]] == mode).all())
+
+
+def test_a_rare_mode_has_its_own_center_beside_a_wide_one():
+    features, modes = on_a_circle(np.linspace(0, 2, 500), np.linspace(2.6, 2.65, 5))
+    by_kmeans = KMeans(3, n_init=10, random_state=0).fit_predict(features.numpy())
+    assert not is_alone(1, modes, by_kmeans), "k-means is not enough here, or the test shows nothing"
+    centers = best_centers(features, 3, np.random.default_rng(0))
+    assert is_alone(1, modes, assign(features, centers).numpy())
+
+
+def test_outliers_do_not_take_the_centers_of_modes():
+    features, modes = on_a_circle(
+        np.linspace(0, 0.3, 100), np.linspace(0.8, 1.1, 100), np.array([3.0]), np.array([4.5])
+    )
+    by_linkage = AgglomerativeClustering(3, linkage="average").fit_predict(features.numpy())
+    assert not is_alone(0, modes, by_linkage), "linkage is enough here, or the test shows nothing"
+    centers = best_centers(features, 3, np.random.default_rng(0))
+    labels = assign(features, centers).numpy()
+    assert is_alone(0, modes, labels) and is_alone(1, modes, labels)
+
+
+def test_as_many_clusters_as_demonstrations_give_each_its_own():
+    features, _ = on_a_circle(np.array([0.0, 1.0, 2.0]))
+    assert len(set(assign(features, best_centers(features, 3, np.random.default_rng(0))).tolist())) == 3
+    torch.testing.assert_close(best_centers(features, 1, np.random.default_rng(0)), features.mean(0, keepdim=True))
+
+
 def test_a_model_without_training_data_for_a_center_leaves_that_cluster_empty():
     demonstrations = three_dynamics((3, 3, 3))
     model = ContrastiveClustering(demonstrations, ClusteringConfig(**SMALL, num_clusters=3), 0).model()
@@ -140,7 +179,7 @@ def test_diagnostics_by_hand():
 
 
 @pytest.mark.parametrize("reduction", ["sum", "mean"])
-@pytest.mark.parametrize("centers", ["trajectories", "kmeans"])
+@pytest.mark.parametrize("centers", ["silhouette", "trajectories", "kmeans"])
 @pytest.mark.parametrize("order", ["step_first", "centers_first"])
 def test_every_reading_of_the_method_trains(reduction, centers, order):
     config = ClusteringConfig(**SMALL, num_clusters=3, reduction=reduction, initial_centers=centers, update_order=order)
