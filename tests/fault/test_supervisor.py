@@ -159,7 +159,7 @@ def test_a_job_that_is_killed_continues_from_its_checkpoint(tmp_path: Path) -> N
 
 
 def test_a_job_that_hangs_is_killed_and_continues_from_its_checkpoint(tmp_path: Path) -> None:
-    run = fake_run(tmp_path, job_timeout_s=4.0)
+    run = fake_run(tmp_path, job_timeout_s=20.0)
     events: list[Event] = []
     outcome = LocalEngine(1).run_jobs(FakeStage(False), run, ["frozen", "a"], events.append, lambda: False)
     assert outcome.done == ["frozen", "a"] and not outcome.failed

@@ -90,7 +90,7 @@ def test_attempts_that_get_further_do_not_use_any_up(tmp_path: Path, cluster: Cl
 
 
 def test_a_job_that_hangs_goes_on(tmp_path: Path, cluster: Cluster) -> None:
-    inline, on_ray = fake_run(tmp_path / "inline"), fake_run(tmp_path / "ray", job_timeout_s=4)
+    inline, on_ray = fake_run(tmp_path / "inline"), fake_run(tmp_path / "ray", job_timeout_s=30)
     LocalEngine(0).run_jobs(FakeStage(False), inline, ["a"], lambda event: None, lambda: False)
     events: list[Event] = []
     outcome = RayEngine().run_jobs(FakeStage(False), on_ray, ["hangs"], events.append, lambda: False)
@@ -118,7 +118,7 @@ def test_units_give_the_same_bits_on_ray(cluster: Cluster, assert_same_bits) -> 
 
 def test_a_unit_that_hangs_is_collected_again(misdeeds: Path, cluster: Cluster, assert_same_bits) -> None:
     units = [replace(unit, env_id=STALLING, dynamics=(), policy=PENDULUM_POLICY) for unit in hopper_units(0)]
-    inline, on_ray = InlineRollouts(), RayRollouts(unit_timeout_s=5)
+    inline, on_ray = InlineRollouts(), RayRollouts(unit_timeout_s=20)
     inline.submit(units)
     expected = inline.gather()
     (misdeeds / "stalls").touch()
