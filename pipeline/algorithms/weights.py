@@ -10,6 +10,9 @@ from oodil.pipeline.data import Demonstrations
 
 Array = NDArray[np.float64]
 
+LEAST_MODE = 0.01
+"""Of all demonstrations: fewer that score alike are no mode by which the others are judged, nor is a single one."""
+
 
 def transferability_of_divergences(divergences: Array) -> Array:
     """Return 2 (1 - D) in [0, 1], where D tells a demonstration from the imitator's own fresh episodes.
@@ -31,14 +34,20 @@ def share_lasted(demonstrations: Demonstrations, horizon: int) -> Array:
     return np.where(demonstrations.terminated, lasted, 1.0)
 
 
-def best_mode(readings: Array, share: float) -> float:
+def best_mode(readings: Array, share: float, least: float) -> float:
     """Return what the best demonstrations of a cluster score: those that reach ``share`` of its highest score.
 
     It is the mean of their (R, N) readings. A cluster may hold another mode as well, which its imitator reproduces
-    less; the mean of all would say how many of those there are.
+    less; the mean of all would say how many of those there are. Fewer than ``least`` of them are outliers and no mode:
+    the next highest score counts. Returns 0 if no mode is left.
     """
-    scores = readings.mean(axis=0)
-    return float(readings[:, scores >= share * scores.max()].mean())
+    best_first = readings[:, np.argsort(-readings.mean(axis=0), kind="stable")]
+    scores = best_first.mean(axis=0)
+    for first, highest in enumerate(scores):
+        alike = np.flatnonzero(scores[first:] >= share * highest) + first
+        if len(alike) >= least:
+            return float(best_first[:, alike].mean())
+    return 0.0
 
 
 def kept_weights(scores: Array, intervals: Array, threshold: float) -> Array:

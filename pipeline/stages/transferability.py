@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodil.pipeline.algorithms.weights import (
+    LEAST_MODE,
     best_mode,
     intervals,
     kept_weights,
@@ -46,7 +47,7 @@ class TransferabilityStage(Weighting):
 
     name = "transferability"
     title = "ours"
-    version = 4
+    version = 5
     inputs = ("demonstrations", "clustering", "imitators")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
@@ -120,7 +121,11 @@ class TransferabilityStage(Weighting):
             history[cluster] = ScoreHistory.load(run.job_artifact(ImitatorsStage.name, job))
         labels = load_assignment(run).labels
         readings = self._readings(run.config, demonstrations, divergences)
-        best = max(best_mode(readings[:, labels == cluster], section.kept_from) for cluster in history)
+        by_cluster = [readings[:, labels == cluster] for cluster in history]
+        least = max(2, LEAST_MODE * len(demonstrations))
+        best = max(best_mode(each, section.kept_from, least) for each in by_cluster)
+        if best == 0:
+            best = max(best_mode(each, section.kept_from, least=1) for each in by_cluster)
         found = self._judged(run.config, readings, labels, section.kept_from * best)
         if fresh:
             found.intervals[np.bincount(labels)[labels] == 1] = 0, 1  # Its readers have seen it, and there is no other.
