@@ -208,20 +208,22 @@ class ContrastiveClustering:
 
     @torch.no_grad()
     def _initial_centers(self) -> tuple[Tensor, float]:
-        """Return (K, E) centers, by k-means, by linkage or of K random demonstrations, and the stability of labels."""
+        """Return (K, E) centers to begin with, and how stable labels are by k-means, or by random demonstrations."""
         config = self.config
         rng = numpy_rng(self._key("centres"))
         features = _encode_all(self.encoder, self._subtrajectories, config.label_draws, self._key("centres", "views"))
         mean = self.encoder.of_demonstrations(features)
         if config.initial_centers == "trajectories":
             centers = features[0, rng.permutation(len(mean))[: config.num_clusters]]
-        elif config.initial_centers == "silhouette":
-            centers = best_centers(mean, config.num_clusters, rng)
         else:
             centers, _ = _kmeans(mean, config.num_clusters, rng)
         if config.normalize_centers:
             centers = normalize(centers, dim=-1)
-        return centers, _stability(features, mean, centers)
+        # The groups of linkage are coarse beside outliers, and stable also where features do not suffice.
+        stability = _stability(features, mean, centers)
+        if config.initial_centers == "silhouette":
+            centers = clearer_centers(mean, centers, rng)
+        return centers, stability
 
     def _move_centers(self, features: Tensor, labels: Tensor) -> None:
         """Update centers and counters with a batch (Eqn 4)."""
@@ -244,19 +246,23 @@ def clusters_of_states(demonstrations: Demonstrations, config: ClusteringConfig,
     return _model(encoder, centers, labels.bincount(minlength=config.num_clusters), subtrajectories)
 
 
-def best_centers(features: Tensor, num_clusters: int, rng: np.random.Generator) -> Tensor:
-    """Return (K, E) centers of (N, E) unit features, by k-means or linkage: those with the greater silhouette.
+def clearer_centers(features: Tensor, centers: Tensor, rng: np.random.Generator) -> Tensor:
+    """Return (K, E) unit centers of k-means, or those of average linkage if its groups have the greater silhouette.
 
     The squared distances of k-means would rather divide a large, wide mode once more than tell a rare one from it.
     Average linkage goes by the distance between groups, whatever their size, but spends groups on outliers.
+
+    Args:
+        features, centers: (N, E) and (K, E) of length 1.
+        rng: draws `COMPARED_AT_ONCE` demonstrations where there are more.
     """
-    by_kmeans, _ = _kmeans(features, num_clusters, rng)
     drawn = features[rng.permutation(len(features))[:COMPARED_AT_ONCE]]
+    num_clusters = len(centers)
     if not 1 < num_clusters < len(drawn):
-        return by_kmeans
+        return centers
     groups = AgglomerativeClustering(num_clusters, linkage="average").fit_predict(drawn.numpy())
-    by_linkage = torch.stack([drawn[groups == k].mean(0) for k in range(num_clusters)])
-    return max((by_kmeans, by_linkage), key=lambda centers: _silhouette(drawn, normalize(centers, dim=-1)))
+    linked = normalize(torch.stack([drawn[groups == k].mean(0) for k in range(num_clusters)]), dim=-1)
+    return max((centers, linked), key=lambda each: _silhouette(drawn, each))
 
 
 def _silhouette(features: Tensor, centers: Tensor) -> float:

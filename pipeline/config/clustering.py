@@ -42,8 +42,8 @@ class ClusteringConfig(Section):
     batch_size: PositiveInt = 128
     """Demonstrations per iteration; all of them if there are fewer."""
     initial_centers: Literal["silhouette", "trajectories", "kmeans"] = "silhouette"
-    """K-means or average linkage, whichever has the greater silhouette, K random demonstrations (appendix), or k-means
-    (official code)."""
+    """K-means (official code), K random demonstrations (appendix), or k-means unless average linkage has the greater
+    silhouette."""
     initial_count: PositiveInt = 100
     """Counter at which each center's running mean starts."""
     update_order: Literal["step_first", "centers_first"] = "step_first"

@@ -9,14 +9,15 @@ import pytest
 import torch
 from sklearn.cluster import AgglomerativeClustering, KMeans
 from sklearn.metrics import calinski_harabasz_score, silhouette_score
+from torch.nn.functional import normalize
 
 from oodil.pipeline.algorithms.clustering import (
     ClusterModel,
     ContrastiveClustering,
     Labeling,
     assign,
-    best_centers,
     center_loss,
+    clearer_centers,
     clusters_of_states,
     moved_centers,
 )
@@ -126,11 +127,17 @@ def is_alone(mode: int, modes: np.ndarray, labels: np.ndarray) -> bool:
     return len(mine) == 1 and bool((modes[labels == mine[0]] == mode).all())
 
 
+def kmeans_centers(features: torch.Tensor, num_clusters: int) -> torch.Tensor:
+    """Return unit centers of k-means."""
+    found = KMeans(num_clusters, n_init=10, random_state=0).fit(features.numpy())
+    return normalize(torch.from_numpy(found.cluster_centers_), dim=-1)
+
+
 def test_a_rare_mode_has_its_own_center_beside_a_wide_one():
     features, modes = on_a_circle(np.linspace(0, 2, 500), np.linspace(2.6, 2.65, 5))
-    by_kmeans = KMeans(3, n_init=10, random_state=0).fit_predict(features.numpy())
-    assert not is_alone(1, modes, by_kmeans), "k-means is not enough here, or the test shows nothing"
-    centers = best_centers(features, 3, np.random.default_rng(0))
+    by_kmeans = kmeans_centers(features, 3)
+    assert not is_alone(1, modes, assign(features, by_kmeans).numpy()), "k-means is enough: the test shows nothing"
+    centers = clearer_centers(features, by_kmeans, np.random.default_rng(0))
     assert is_alone(1, modes, assign(features, centers).numpy())
 
 
@@ -139,16 +146,26 @@ def test_outliers_do_not_take_the_centers_of_modes():
         np.linspace(0, 0.3, 100), np.linspace(0.8, 1.1, 100), np.array([3.0]), np.array([4.5])
     )
     by_linkage = AgglomerativeClustering(3, linkage="average").fit_predict(features.numpy())
-    assert not is_alone(0, modes, by_linkage), "linkage is enough here, or the test shows nothing"
-    centers = best_centers(features, 3, np.random.default_rng(0))
-    labels = assign(features, centers).numpy()
-    assert is_alone(0, modes, labels) and is_alone(1, modes, labels)
+    assert not is_alone(0, modes, by_linkage), "linkage is enough: the test shows nothing"
+    centers = kmeans_centers(features, 3)
+    torch.testing.assert_close(clearer_centers(features, centers, np.random.default_rng(0)), centers, rtol=0, atol=0)
 
 
-def test_as_many_clusters_as_demonstrations_give_each_its_own():
+@pytest.mark.parametrize("num_clusters", [1, 3])
+def test_centers_rest_where_there_is_nothing_to_compare(num_clusters: int):
     features, _ = on_a_circle(np.array([0.0, 1.0, 2.0]))
-    assert len(set(assign(features, best_centers(features, 3, np.random.default_rng(0))).tolist())) == 3
-    torch.testing.assert_close(best_centers(features, 1, np.random.default_rng(0)), features.mean(0, keepdim=True))
+    centers = kmeans_centers(features, num_clusters)
+    assert clearer_centers(features, centers, np.random.default_rng(0)) is centers
+
+
+def test_the_warm_up_depends_on_kmeans_alone():
+    """Of two outliers and a wide mode linkage makes three stable groups; k-means divides the mode."""
+    demonstrations = three_dynamics((20, 1, 1))
+    begun = {
+        centers: ContrastiveClustering(demonstrations, ClusteringConfig(**SMALL, initial_centers=centers), 0).iteration
+        for centers in ("kmeans", "silhouette")
+    }
+    assert begun["silhouette"] == begun["kmeans"]
 
 
 def test_a_model_without_training_data_for_a_center_leaves_that_cluster_empty():
