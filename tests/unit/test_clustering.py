@@ -158,14 +158,12 @@ def test_centers_rest_where_there_is_nothing_to_compare(num_clusters: int):
     assert clearer_centers(features, centers, np.random.default_rng(0)) is centers
 
 
-def test_the_warm_up_depends_on_kmeans_alone():
-    """Of two outliers and a wide mode linkage makes three stable groups; k-means divides the mode."""
-    demonstrations = three_dynamics((20, 1, 1))
-    begun = {
-        centers: ContrastiveClustering(demonstrations, ClusteringConfig(**SMALL, initial_centers=centers), 0).iteration
-        for centers in ("kmeans", "silhouette")
-    }
-    assert begun["silhouette"] == begun["kmeans"]
+@pytest.mark.parametrize(("sufficient", "skipped"), [(0.75, False), (0.65, True)])
+def test_the_warm_up_is_skipped_by_the_stability_of_kmeans(sufficient: float, skipped: bool):
+    """Here it is 0.71; that of the groups of linkage, two of which are outliers, is 0.78."""
+    config = ClusteringConfig(**SMALL, initial_centers="silhouette", sufficient_stability=sufficient)
+    clustering = ContrastiveClustering(three_dynamics((30, 1, 1), seed=1), config, 0)
+    assert clustering.iteration == (config.warmup_iterations if skipped else 0)
 
 
 def test_a_model_without_training_data_for_a_center_leaves_that_cluster_empty():
