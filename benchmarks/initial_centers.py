@@ -11,44 +11,38 @@ from typing import Any
 
 import numpy as np
 from common import arguments_of, circumstances, one_thread, save, seeds_of
-from sklearn.metrics import silhouette_score
 
 import oodil
-from oodil.pipeline.algorithms.clustering import ClusterModel, ContrastiveClustering
+from oodil.pipeline.algorithms.clustering import ContrastiveClustering
 from oodil.pipeline.config import ClusteringConfig
 from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.stages.clustering import contingency, purity
+from oodil.pipeline.results import ClusterDiagnostics
+from oodil.pipeline.stages.clustering import diagnostics
 
 
 def measure(demonstrations: Demonstrations, marked: list[bool], section: ClusteringConfig, seed: int) -> dict[str, Any]:
     clustering = ContrastiveClustering(demonstrations, section, seed)
-    warmup = section.warmup_iterations
-    while clustering.iteration < warmup:
-        clustering.update()
-    began = labeled(clustering.model(), demonstrations, section, seed)
-    while clustering.iteration < clustering.num_iterations:
-        clustering.update()
-    ended = labeled(clustering.model(), demonstrations, section, seed)
-    table = contingency(ended[0], demonstrations.sources, section.num_clusters, len(marked))
-    homes = {int(counts.argmax()) for counts, mark in zip(table, marked, strict=True) if mark}
-    others = int(table[np.ix_([i for i, mark in enumerate(marked) if not mark], sorted(homes))].sum())
+    at_first, at_last = (
+        judged(clustering, until, demonstrations, seed)
+        for until in (section.warmup_iterations, clustering.num_iterations)
+    )
+    table = np.array(at_last.contingency)
+    homes = sorted({int(counts.argmax()) for counts, mark in zip(table, marked, strict=True) if mark})
     return {
-        "silhouette_at_first": round(silhouette_of(*began), 4),
-        "purity": round(purity(table), 4),
-        "others_at_home": others,
+        "silhouette_at_first": at_first.silhouette,
+        "purity": at_last.purity,
+        "others_at_home": int(table[~np.array(marked)][:, homes].sum()),
         "contingency": table.tolist(),
     }
 
 
-def labeled(
-    model: ClusterModel, demonstrations: Demonstrations, section: ClusteringConfig, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
-    labeling = model.label(demonstrations, section.label_draws, seed)
-    return labeling.labels, labeling.features
-
-
-def silhouette_of(labels: np.ndarray, features: np.ndarray) -> float:
-    return float(silhouette_score(features, labels, metric="cosine"))
+def judged(
+    clustering: ContrastiveClustering, until: int, demonstrations: Demonstrations, seed: int
+) -> ClusterDiagnostics:
+    while clustering.iteration < until:
+        clustering.update()
+    labeling = clustering.model().label(demonstrations, clustering.config.label_draws, seed)
+    return diagnostics(labeling, demonstrations, clustering.config.num_clusters)
 
 
 def main() -> None:

@@ -217,18 +217,22 @@ class ContrastiveClustering:
             centers = features[0, rng.permutation(len(mean))[: config.num_clusters]]
         else:
             centers, _ = _kmeans(mean, config.num_clusters, rng)
-        if config.normalize_centers:
-            centers = normalize(centers, dim=-1)
+        centers = self._scaled(centers)
         # The groups of linkage are coarse beside outliers, and stable also where features do not suffice.
         stability = _stability(features, mean, centers)
-        if config.initial_centers == "silhouette":
-            centers = clearer_centers(mean, centers, rng)
+        drawn = mean[rng.permutation(len(mean))[:COMPARED_AT_ONCE]]
+        if config.initial_centers == "silhouette" and 1 < config.num_clusters < len(drawn):
+            centers = clearer_centers(drawn, centers, self._scaled(linked_centers(drawn, config.num_clusters)))
         return centers, stability
 
     def _move_centers(self, features: Tensor, labels: Tensor) -> None:
         """Update centers and counters with a batch (Eqn 4)."""
         centers, self.counts = moved_centers(self.centers, self.counts, features, labels)
-        self.centers = normalize(centers, dim=-1) if self.config.normalize_centers else centers
+        self.centers = self._scaled(centers)
+
+    def _scaled(self, centers: Tensor) -> Tensor:
+        """Return centers on the unit sphere, if they are kept there."""
+        return normalize(centers, dim=-1) if self.config.normalize_centers else centers
 
     def _key(self, *path: str | int) -> Key:
         return derive_key(self.root_seed, "clustering", *path)
@@ -246,23 +250,19 @@ def clusters_of_states(demonstrations: Demonstrations, config: ClusteringConfig,
     return _model(encoder, centers, labels.bincount(minlength=config.num_clusters), subtrajectories)
 
 
-def clearer_centers(features: Tensor, centers: Tensor, rng: np.random.Generator) -> Tensor:
-    """Return (K, E) unit centers of k-means, or those of average linkage if its groups have the greater silhouette.
+def linked_centers(features: Tensor, num_clusters: int) -> Tensor:
+    """Return (K, E) means of the groups of average linkage of (N, E) features, 1 < K < N.
 
     The squared distances of k-means would rather divide a large, wide mode once more than tell a rare one from it.
-    Average linkage goes by the distance between groups, whatever their size, but spends groups on outliers.
-
-    Args:
-        features, centers: (N, E) and (K, E) of length 1.
-        rng: draws `COMPARED_AT_ONCE` demonstrations where there are more.
+    Linkage goes by the distance between groups, whatever their size, but spends groups on outliers.
     """
-    drawn = features[rng.permutation(len(features))[:COMPARED_AT_ONCE]]
-    num_clusters = len(centers)
-    if not 1 < num_clusters < len(drawn):
-        return centers
-    groups = AgglomerativeClustering(num_clusters, linkage="average").fit_predict(drawn.numpy())
-    linked = normalize(torch.stack([drawn[groups == k].mean(0) for k in range(num_clusters)]), dim=-1)
-    return max((centers, linked), key=lambda each: _silhouette(drawn, each))
+    groups = AgglomerativeClustering(num_clusters, linkage="average").fit_predict(features.numpy())
+    return torch.stack([features[groups == k].mean(0) for k in range(num_clusters)])
+
+
+def clearer_centers(features: Tensor, *candidates: Tensor) -> Tensor:
+    """Return that of some (K, E) centers whose groups of (N, E) features have the greatest silhouette, K < N."""
+    return max(candidates, key=lambda centers: _silhouette(features, centers))
 
 
 def _silhouette(features: Tensor, centers: Tensor) -> float:

@@ -34,20 +34,30 @@ def share_lasted(demonstrations: Demonstrations, horizon: int) -> Array:
     return np.where(demonstrations.terminated, lasted, 1.0)
 
 
-def best_mode(readings: Array, share: float, least: float) -> float:
-    """Return what the best demonstrations of a cluster score: those that reach ``share`` of its highest score.
+def best_mode(readings: Array, clusters: NDArray[np.int32], share: float) -> float:
+    """Return the best score of a mode: of those demonstrations of a cluster that reach ``share`` of its highest score.
 
     It is the mean of their (R, N) readings. A cluster may hold another mode as well, which its imitator reproduces
-    less; the mean of all would say how many of those there are. Fewer than ``least`` of them are outliers and no mode:
-    the next highest score counts. Returns 0 if no mode is left.
+    less; the mean of all would say how many of those there are. A group of fewer than `LEAST_MODE`, or of one, counts
+    only if there is no other anywhere.
     """
+    by_cluster = [readings[:, clusters == k] for k in np.unique(clusters)]
+    for least in (max(2.0, LEAST_MODE * len(clusters)), 1.0):
+        found = [score for each in by_cluster if (score := _mode(each, share, least)) is not None]
+        if found:
+            break
+    return max(found)
+
+
+def _mode(readings: Array, share: float, least: float) -> float | None:
+    """Return the score of the best mode of a cluster; with fewer than ``least`` alike the next highest score counts."""
     best_first = readings[:, np.argsort(-readings.mean(axis=0), kind="stable")]
     scores = best_first.mean(axis=0)
     for first, highest in enumerate(scores):
         alike = np.flatnonzero(scores[first:] >= share * highest) + first
         if len(alike) >= least:
             return float(best_first[:, alike].mean())
-    return 0.0
+    return None
 
 
 def kept_weights(scores: Array, intervals: Array, threshold: float) -> Array:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodil.pipeline.algorithms.weights import (
-    LEAST_MODE,
     best_mode,
     intervals,
     kept_weights,
@@ -121,12 +120,8 @@ class TransferabilityStage(Weighting):
             history[cluster] = ScoreHistory.load(run.job_artifact(ImitatorsStage.name, job))
         labels = load_assignment(run).labels
         readings = self._readings(run.config, demonstrations, divergences)
-        by_cluster = [readings[:, labels == cluster] for cluster in history]
-        least = max(2, LEAST_MODE * len(demonstrations))
-        best = max(best_mode(each, section.kept_from, least) for each in by_cluster)
-        if best == 0:
-            best = max(best_mode(each, section.kept_from, least=1) for each in by_cluster)
-        found = self._judged(run.config, readings, labels, section.kept_from * best)
+        threshold = section.kept_from * best_mode(readings, labels, section.kept_from)
+        found = self._judged(run.config, readings, labels, threshold)
         if fresh:
             found.intervals[np.bincount(labels)[labels] == 1] = 0, 1  # Its readers have seen it, and there is no other.
         return replace(found, env_steps=env_steps, read_from=read_from, history=history).files()

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from sklearn.cluster import AgglomerativeClustering, KMeans
+from sklearn.cluster import KMeans
 from sklearn.metrics import calinski_harabasz_score, silhouette_score
 from torch.nn.functional import normalize
 
@@ -19,6 +19,7 @@ from oodil.pipeline.algorithms.clustering import (
     center_loss,
     clearer_centers,
     clusters_of_states,
+    linked_centers,
     moved_centers,
 )
 from oodil.pipeline.artifacts import RunDirectory, write_artifact
@@ -137,7 +138,7 @@ def test_a_rare_mode_has_its_own_center_beside_a_wide_one():
     features, modes = on_a_circle(np.linspace(0, 2, 500), np.linspace(2.6, 2.65, 5))
     by_kmeans = kmeans_centers(features, 3)
     assert not is_alone(1, modes, assign(features, by_kmeans).numpy()), "k-means is enough: the test shows nothing"
-    centers = clearer_centers(features, by_kmeans, np.random.default_rng(0))
+    centers = clearer_centers(features, by_kmeans, linked_centers(features, 3))
     assert is_alone(1, modes, assign(features, centers).numpy())
 
 
@@ -145,17 +146,15 @@ def test_outliers_do_not_take_the_centers_of_modes():
     features, modes = on_a_circle(
         np.linspace(0, 0.3, 100), np.linspace(0.8, 1.1, 100), np.array([3.0]), np.array([4.5])
     )
-    by_linkage = AgglomerativeClustering(3, linkage="average").fit_predict(features.numpy())
-    assert not is_alone(0, modes, by_linkage), "linkage is enough: the test shows nothing"
-    centers = kmeans_centers(features, 3)
-    torch.testing.assert_close(clearer_centers(features, centers, np.random.default_rng(0)), centers, rtol=0, atol=0)
+    linked, by_kmeans = linked_centers(features, 3), kmeans_centers(features, 3)
+    assert not is_alone(0, modes, assign(features, linked).numpy()), "linkage is enough: the test shows nothing"
+    assert clearer_centers(features, by_kmeans, linked) is by_kmeans
 
 
-@pytest.mark.parametrize("num_clusters", [1, 3])
-def test_centers_rest_where_there_is_nothing_to_compare(num_clusters: int):
-    features, _ = on_a_circle(np.array([0.0, 1.0, 2.0]))
-    centers = kmeans_centers(features, num_clusters)
-    assert clearer_centers(features, centers, np.random.default_rng(0)) is centers
+@pytest.mark.parametrize("num_clusters", [1, 6])
+def test_clusters_begin_where_there_is_nothing_to_compare(num_clusters: int):
+    config = ClusteringConfig(**SMALL, num_clusters=num_clusters)
+    assert len(ContrastiveClustering(three_dynamics((2, 2, 2)), config, 0).model().centers) == num_clusters
 
 
 @pytest.mark.parametrize(("sufficient", "skipped"), [(0.75, False), (0.65, True)])

@@ -55,17 +55,25 @@ def test_weights_are_the_scores_of_what_surely_reaches_the_threshold():
 
 @pytest.mark.parametrize("others", [0, 1, 500])
 def test_what_the_best_of_a_cluster_score_does_not_depend_on_how_many_others_it_holds(others: int):
-    best, worse = np.array([[0.3, 0.2, 0.1], [0.5, 0.2, 0.3]]), np.tile([[0.09], [0.01]], others)
+    best, worse = np.tile([[0.3, 0.2, 0.1], [0.5, 0.2, 0.3]], 10), np.tile([[0.09], [0.01]], others)
     readings = np.concatenate((best, worse), axis=1)
-    assert best_mode(readings, 0.5, least=2) == pytest.approx((0.4 + 0.2 + 0.2) / 3)
-    assert best_mode(readings, 0.0, least=2) == pytest.approx((0.8 + 0.05 * others) / (3 + others))
+    clusters = np.zeros(30 + others, np.int32)
+    assert best_mode(readings, clusters, 0.5) == pytest.approx((0.4 + 0.2 + 0.2) / 3)
+    assert best_mode(readings, clusters, 0.0) == pytest.approx((8 + 0.05 * others) / (30 + others))
 
 
 def test_outliers_are_no_mode():
-    """0.9 is alone, 0.3 and 0.2 are two, and 0.08, 0.06 and 0.05 are the first three that are alike."""
-    readings = np.array([[0.05, 0.9, 0.2, 0.01, 0.06, 0.3, 0.08]])
-    modes = [best_mode(readings, 0.5, least) for least in (1, 2, 3, 4)]
-    assert modes == pytest.approx([0.9, 0.25, 0.19 / 3, 0.0])
+    """A hundredth of 300 is three: 0.9 is alone, 0.3 and 0.2 are two, and 0.08, 0.06 and 0.05 are three."""
+    scores, others = [0.05, 0.9, 0.2, 0.01, 0.06, 0.3, 0.08], [0.001] * 293
+    clusters = np.repeat(np.array([0, 1], np.int32), [7, 293])
+    assert best_mode(np.array([scores + others]), clusters, 0.5) == pytest.approx(0.19 / 3)
+    assert best_mode(np.array([scores]), clusters[:7], 0.5) == pytest.approx(0.25), "of seven, two are a mode"
+
+
+def test_a_single_demonstration_is_a_mode_where_there_is_no_other():
+    readings = np.array([[0.9, 0.3, 0.1]])
+    assert best_mode(readings, np.arange(3, dtype=np.int32), 0.5) == pytest.approx(0.9)
+    assert best_mode(readings, np.zeros(3, np.int32), 0.5) == pytest.approx(0.9)
 
 
 def test_an_interval_is_two_errors_around_the_mean_and_everything_with_one_reading():
