@@ -299,7 +299,7 @@ def separation_metrics(
     shares = {name: float(sampling_mass(w, demonstrations)[marks].sum()) for name, w in by_share.items()}
     auroc = float(roc_auc_score(marks, scores))
     kept = weights[marks]
-    return {"auroc": auroc, **shares, "effective_number": effective_number(kept) if kept.any() else 0.0}
+    return {"auroc": auroc, **shares, "effective_number": effective_number(kept)}
 
 
 def shown_return(value: float) -> str:

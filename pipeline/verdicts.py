@@ -61,6 +61,8 @@ class VerdictTable:
     """From which score a demonstration is kept."""
     effective_number: float
     """How many demonstrations of equal weight would be as even."""
+    drawn_score: float | None
+    """Mean score of the demonstrations that weigh more than nothing; none if there are none."""
 
     @classmethod
     def of(cls, found: Transferability, demonstrations: Demonstrations) -> "VerdictTable":
@@ -77,17 +79,18 @@ class VerdictTable:
         known = np.unique(found.clusters[found.clusters >= 0]).tolist()
         clusters = [_verdicts(str(k), found.clusters == k, found, masses) for k in known]
         best_first = tuple(sorted(clusters, key=lambda each: -np.nan_to_num(each.score)))
-        return cls(tuple(sources), best_first, found.threshold, effective_number(found.weights))
+        drawn = found.scores[found.weights > 0]
+        score = float(drawn.mean()) if len(drawn) else None
+        return cls(tuple(sources), best_first, found.threshold, effective_number(found.weights), score)
 
     @property
     def warning(self) -> str:
-        """That nothing is reproduced well, if so: the mean score of the best cluster says it."""
-        if not self.by_cluster or self.by_cluster[0].score >= LITTLE:
+        """That nothing is reproduced well, if so: the mean score of what is drawn says it."""
+        if not self.by_cluster or self.drawn_score is None or self.drawn_score >= LITTLE:
             return ""
-        best = self.by_cluster[0]
         return (
-            f"Nothing is reproduced well: even the best cluster ({best.name}) has a mean score of only "
-            f"{best.score:.3f}, below {LITTLE:g}. What is kept is the best there is, not what is good: train the "
+            "Nothing is reproduced well: the demonstrations that are drawn have a mean score of only "
+            f"{self.drawn_score:.3f}, below {LITTLE:g}. They are the best there are, not good ones: train the "
             "imitators for longer, or the imitator cannot do what was demonstrated."
         )
 

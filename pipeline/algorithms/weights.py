@@ -63,13 +63,15 @@ def _mode(readings: Array, share: float, least: float) -> float | None:
 def kept_weights(scores: Array, intervals: Array, threshold: float) -> Array:
     """Return (N,) weights that sum to one: the scores of those whose whole interval (N, 2) reaches the threshold.
 
-    If there is none, those count whose interval holds it; if there is no such either, all count the same.
+    If there is none, those count whose interval holds it; if there is no such either, all that have a score count the
+    same. What has none, NaN, weighs nothing: all weights are 0 where no demonstration has a score.
     """
     for limit in intervals.T:
         weights = np.where(limit >= threshold, np.nan_to_num(scores), 0.0)
         if weights.sum() > 0:
             return np.asarray(weights / weights.sum())
-    return np.full(len(scores), 1 / len(scores))
+    scored = np.isfinite(scores)
+    return np.asarray(scored / max(scored.sum(), 1))
 
 
 def intervals(readings: Array) -> Array:
@@ -83,10 +85,13 @@ def intervals(readings: Array) -> Array:
 
 def effective_number(weights: Array) -> float:
     """Return how many demonstrations of equal weight would be as even: (sum w)^2 / sum w^2 of (N,) weights."""
-    return float(weights.sum() ** 2 / np.square(weights).sum())
+    return float(weights.sum() ** 2 / np.square(weights).sum()) if weights.any() else 0.0
 
 
 def sampling_mass(weights: Array, demonstrations: Demonstrations) -> Array:
-    """Return (N,) shares of the sampled transitions, proportional to weight times number of transitions (Eqn 7)."""
+    """Return (N,) shares of the sampled transitions, proportional to weight times number of transitions (Eqn 7).
+
+    They sum to one, or are all 0 as the weights are.
+    """
     mass = weights * (demonstrations.lengths - 1)
-    return np.asarray(mass / mass.sum())
+    return np.asarray(mass / mass.sum() if weights.any() else mass)

@@ -129,7 +129,7 @@ class Transferability:
     scores: NDArray[np.float64]
     """(N,) in [0, 1], higher where the imitator can reproduce more; NaN for new ones that are unlike any it knows."""
     weights: NDArray[np.float64]
-    """(N,) not negative, summing to one."""
+    """(N,) not negative, summing to one; all 0 if no demonstration has a score."""
     clusters: NDArray[np.int32]
     """(N,) cluster ids; -1 for a weighting without clusters."""
     intervals: NDArray[np.float64]

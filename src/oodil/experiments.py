@@ -4,7 +4,6 @@ A job executes its run inline, so as many runs are at work at once as the engine
 `oodil.whole_runs`.
 """
 
-import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,6 +16,7 @@ from oodil.pipeline.errors import ConfigError, OodilError, StorageError
 from oodil.pipeline.experiment import ExperimentConfig, PlannedRun, parts_of, plan
 from oodil.pipeline.locks import held
 from oodil.pipeline.records import records
+from oodil.pipeline.report.table.records import read_made
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.stage import Run, Stage
 from oodil.pipeline.versions import library_versions
@@ -105,11 +105,12 @@ class Table:
         """Bring the selected stages of every run to their finished artifacts; what is finished is reused.
 
         Raises ConfigError, and leaves everything as it is, if a run is there with other settings, or if another process
-        works on the table.
+        works on the table; DataError if what is known of earlier commands cannot be read.
         """
         for run in self.runs:
             if run.name in selected:
                 _refuse_other_settings(self.opened(run))
+        read_made(self.folder)
         try:
             self.runner.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -141,8 +142,7 @@ class Table:
         Seconds are of the stages that were finished since the last command that is there. One that finished none is
         left out.
         """
-        path = self.folder / MADE
-        earlier = json.loads(path.read_bytes()) if path.exists() else []
+        path, earlier = self.folder / MADE, read_made(self.folder)
         spent = {run.name: sum(RunResults(self.opened(run)).seconds().values()) for run in self.runs}
         for each in earlier:
             for name, seconds in each["seconds"].items():

@@ -73,6 +73,15 @@ def test_every_weighting_that_can_speaks(results: oodil.RunResults, later: Demon
     assert oodil.open_run(results.path).describe()["stages"] == hashes
 
 
+def test_where_everything_is_unlike_nothing_has_weight(
+    results: oodil.RunResults, later: Demonstrations, tmp_path: Path
+) -> None:
+    path = tmp_path / "strange.safetensors"
+    write_file(path, encode_demonstrations(later.select(np.array([2])), HOPPER))
+    assert oodil.score(results, path).found["transferability"].weights.tolist() == [0]
+    assert "nan" not in shown(results.path, path, "--weighting", "transferability").lower()
+
+
 def test_a_table_by_source_and_by_demonstration(results: oodil.RunResults, file: Path) -> None:
     output = shown(results.path, file)
     assert "ours: kept from" in output and "distance: kept from" in output

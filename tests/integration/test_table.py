@@ -192,6 +192,15 @@ def test_another_configuration_is_refused(whole: Path) -> None:
     assert (whole / "results.json").read_bytes() == before
 
 
+def test_a_folder_that_says_nothing_of_its_making_is_refused_before_any_work(tmp_path: Path) -> None:
+    write_experiment(tmp_path)
+    (tmp_path / "micro").mkdir()
+    (tmp_path / "micro" / "made.json").write_text("{}")
+    code, output = LiveRun(*command(tmp_path, 1)).finish()
+    assert code == 2 and "made.json: expected a list, found a dict" in output, output
+    assert [path.name for path in (tmp_path / "micro").iterdir()] == ["made.json"]
+
+
 def test_a_plan_computes_nothing(tmp_path: Path) -> None:
     write_experiment(tmp_path)
     output = run(*command(tmp_path, 1, "--plan", "--rows", "all"))

@@ -286,6 +286,13 @@ def test_a_folder_without_records_is_refused(tmp_path: Path):
         write_table(tmp_path)
 
 
+@pytest.mark.parametrize(("text", "message"), [("{}", "expected a list"), ("[{}]", "every entry needs the seconds")])
+def test_what_is_known_of_its_making_is_as_described(folder: Path, text: str, message: str):
+    (folder / "made.json").write_text(text)
+    with pytest.raises(DataError, match=f"{re.escape(str(folder / 'made.json'))}: {message}"):
+        write_table(folder)
+
+
 def test_the_results_in_the_docs_are_those_that_are_committed():
     """If this fails, run ``python docs/make_results.py``."""
     script = runpy.run_path(str(ROOT / "docs" / "make_results.py"))

@@ -50,7 +50,8 @@ def test_weights_are_the_scores_of_what_surely_reaches_the_threshold():
     np.testing.assert_allclose(kept_weights(scores, limits, 0.3), [0.6 / 1.1, 0, 0.5 / 1.1, 0])
     np.testing.assert_allclose(kept_weights(scores, limits, 0.4), [1, 0, 0, 0])
     np.testing.assert_allclose(kept_weights(scores, limits, 0.6), [0.6 / 1.1, 0, 0.5 / 1.1, 0], err_msg="all open")
-    np.testing.assert_allclose(kept_weights(scores, limits, 0.9), [0.25] * 4)
+    np.testing.assert_allclose(kept_weights(scores, limits, 0.9), [1 / 3, 1 / 3, 1 / 3, 0])
+    np.testing.assert_array_equal(kept_weights(scores[3:], limits[3:], 0.3), [0])
 
 
 @pytest.mark.parametrize("others", [0, 1, 500])
@@ -93,9 +94,11 @@ def test_verdicts_follow_from_the_interval():
 def test_the_effective_number_counts_equal_weights():
     assert effective_number(np.array([0.2, 0.2, 0.2, 0.0])) == pytest.approx(3)
     assert effective_number(np.array([1.0, 1e-9])) == pytest.approx(1)
+    assert effective_number(np.zeros(2)) == 0
 
 
 def test_mass_is_weight_times_transitions(demonstrations):
     """Two demonstrations with 3 and 1 transitions and weights 1 and 3 weigh the same."""
     np.testing.assert_allclose(sampling_mass(np.array([1.0, 3.0]), demonstrations(4, 2)), [0.5, 0.5])
     assert sampling_mass(np.array([1.0, 1.0]), demonstrations(4, 2)) == pytest.approx([0.75, 0.25])
+    np.testing.assert_array_equal(sampling_mass(np.zeros(2), demonstrations(4, 2)), [0, 0])

@@ -111,13 +111,24 @@ def read_records(folder: Path) -> Records:
     """Return the records of an experiment's folder. Raises DataError for a file that is not as described."""
     path = folder / RESULTS
     values = _read(path, dict)
-    made = _read(folder / MADE, list) if (folder / MADE).is_file() else []
     try:
-        return Records.model_validate(values | {"made": made})
+        return Records.model_validate(values | {"made": read_made(folder)})
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))
         raise DataError(f"{path}: {key + ': ' if key else ''}{first['msg'].removeprefix('Value error, ')}") from None
+
+
+def read_made(folder: Path) -> list[dict[str, Any]]:
+    """Return what is known of each command that computed a part; none if the file is not there.
+
+    Raises DataError for a file that is not as described.
+    """
+    path = folder / MADE
+    made = _read(path, list) if path.is_file() else []
+    if not all(isinstance(each, dict) and isinstance(each.get("seconds"), dict) for each in made):
+        raise DataError(f"{path}: every entry needs the seconds of each run")
+    return made
 
 
 def _read(path: Path, kind: type[Any]) -> Any:
