@@ -78,6 +78,11 @@ class Entry:
     planned: int
     """How many seeds it is to have."""
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether every seed has a figure."""
+        return len(self.by_seed) == self.planned
+
 
 @dataclass(frozen=True)
 class Sweep:
