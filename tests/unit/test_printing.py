@@ -58,7 +58,8 @@ def test_a_run_that_reproduces_nothing_says_so(
     run = full_run(tmp_path, **SMALL)
     score(run, 0.015)
     text = " ".join(printed(RunResults(run), capsys, monkeypatch).split())
-    assert "Nothing is reproduced well" in text and "only 0.015, below 0.02." in text
+    assert "Nothing is reproduced well: the demonstrations that are drawn" in text
+    assert "a mean score of only 0.015, below 0.02." in text
     score(run, 0.15)
     assert "Nothing is reproduced well" not in printed(RunResults(run), capsys, monkeypatch)
 

@@ -48,6 +48,7 @@ def test_nothing_is_reproduced_well_if_what_is_drawn_is_not() -> None:
     assert VerdictTable.of(found, held).warning == ""
     poor = replace(found, scores=np.array([0.004, 0.024, 0.002, 0.002]))  # single high scores do not help
     table = VerdictTable.of(poor, held)
+    assert table.by_cluster[0].score == pytest.approx(0.014)
     assert table.warning.startswith("Nothing is reproduced well") and f"0.014, below {LITTLE:g}" in table.warning
     mixed = replace(poor, weights=np.array([0.0, 1.0, 0.0, 0.0]))  # what else is in its cluster does not matter
     assert VerdictTable.of(mixed, held).warning == ""
@@ -74,3 +75,5 @@ def test_a_table_is_json() -> None:
     assert again["by_cluster"][0]["kept"] == 1
     assert again["nothing_reproduced_well"] is False
     assert again["drawn_score"] == pytest.approx(0.35)
+    parts = {"by_source", "by_cluster", "threshold", "effective_number", "drawn_score", "nothing_reproduced_well"}
+    assert set(again) == parts

@@ -174,29 +174,28 @@ def findings(table: Table) -> Iterator[str]:
         below = [entry for entry in against if table.marked[entry.row, table.ours] == "published"]
         yield _counted(f"“{title}” is at or above the paper", len(against), [entry.row for entry in below], "Below it")
     others = [method for method in records.methods if method not in (table.ours, ORACLE)]
-    beyond = {
-        row: {records.methods[method]: one for method in others if (one := _beyond(table, row, method)) is not None}
+    compared = {
+        row: methods
         for row in records.rows
+        if ours[row].is_complete and (methods := [name for name in others if table.entries[row, name].is_complete])
     }
-    if compared := [row for row in records.rows if beyond[row]]:
+    if compared:
+        close = {
+            row: [records.methods[name] for name in methods if not _beyond(table, row, name)]
+            for row, methods in compared.items()
+        }
         what = f"“{title}” is better than every other complete column but the oracle"
-        close = {row: [method for method, one in beyond[row].items() if not one] for row in compared}
         exceptions = [f"{row} ({', '.join(each)})" for row, each in close.items() if each]
         yield _counted(f"{what} by more than the deviation over seeds", len(compared), exceptions, "Not")
 
 
-def _beyond(table: Table, row: str, method: str) -> bool | None:
-    """Return whether ours is better than a method by more than the larger of their two deviations.
-
-    None unless both have all their seeds, and more than one: what is there first may be what is better.
-    """
-    ours, theirs = (table.entries[row, name] for name in (table.ours, method))
-    if not (ours.is_complete and theirs.is_complete and ours.found and theirs.found):
-        return None
-    means = ours.found.mean, theirs.found.mean
-    better = means[0] - means[1] if table.measure.higher_is_better else means[1] - means[0]
-    deviation = np.maximum(ours.found.deviation, theirs.found.deviation)  # NaN of a single seed stays one
-    return bool(better > deviation) if np.isfinite(deviation) else None
+def _beyond(table: Table, row: str, method: str) -> bool:
+    """Return whether ours is better than a method by more than the larger of their two deviations."""
+    ours, theirs = (table.entries[row, name].found for name in (table.ours, method))
+    if ours is None or theirs is None:
+        return True
+    better = ours.mean - theirs.mean if table.measure.higher_is_better else theirs.mean - ours.mean
+    return better > max(ours.deviation, theirs.deviation)
 
 
 def _counted(what: str, total: int, exceptions: list[str], lead: str) -> str:

@@ -80,8 +80,8 @@ class Entry:
 
     @property
     def is_complete(self) -> bool:
-        """Whether every seed has a figure."""
-        return len(self.by_seed) == self.planned
+        """Whether every seed has a figure, and there are several: what is there first may be what is better."""
+        return 1 < len(self.by_seed) == self.planned
 
 
 @dataclass(frozen=True)
