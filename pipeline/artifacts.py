@@ -19,7 +19,7 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from oodil.pipeline.errors import DamagedArtifactError, StorageError
+from oodil.pipeline.errors import DamagedArtifactError, DataError, StorageError
 
 MANIFEST = "manifest.json"
 RESULTS, MADE = "results.json", "made.json"
@@ -51,6 +51,31 @@ def below(prefix: str, values: Mapping[str, Value]) -> dict[str, Value]:
 def encode_json(value: Any, sort_keys: bool = True) -> bytes:
     """Return readable JSON, keys sorted or in their order; numbers that are not finite become null."""
     return (json.dumps(_finite(value), indent=2, sort_keys=sort_keys, allow_nan=False) + "\n").encode()
+
+
+def read_json(path: Path, kind: type[Value]) -> Value:
+    """Return what a file holds, of a kind. Raises DataError for one that cannot be read or holds another."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise DataError(f"{path}: not valid JSON: {error}") from error
+    if not isinstance(value, kind):
+        raise DataError(f"{path}: expected a {kind.__name__}, found a {type(value).__name__}")
+    return value
+
+
+def read_made(folder: Path) -> list[dict[str, Any]]:
+    """Return how an experiment was made: what is known of each command; nothing if the file is not there.
+
+    Raises DataError for a file that is not as described.
+    """
+    path = folder / MADE
+    made = read_json(path, list) if path.is_file() else []
+    if not all(isinstance(each, dict) and isinstance(each.get("seconds"), dict) for each in made):
+        raise DataError(f"{path}: every entry needs the seconds of each run")
+    return made
 
 
 def _finite(value: Any) -> Any:

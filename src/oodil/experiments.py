@@ -11,12 +11,11 @@ from pathlib import Path
 
 from oodil.bench import machine, raw_rate
 from oodil.orchestrator import check_inputs, open_run, read_run, refuse_to_replace
-from oodil.pipeline.artifacts import MADE, RESULTS, RunDirectory, encode_json, write_file
+from oodil.pipeline.artifacts import MADE, RESULTS, RunDirectory, encode_json, read_made, write_file
 from oodil.pipeline.errors import ConfigError, OodilError, StorageError
 from oodil.pipeline.experiment import ExperimentConfig, PlannedRun, parts_of, plan
 from oodil.pipeline.locks import held
 from oodil.pipeline.records import records
-from oodil.pipeline.report.table.records import read_made
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.stage import Run, Stage
 from oodil.pipeline.versions import library_versions

@@ -1,12 +1,11 @@
 """What an experiment leaves behind, read from its folder: ``results.json`` and, if it is there, ``made.json``."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from oodil.pipeline.artifacts import MADE, RESULTS
+from oodil.pipeline.artifacts import RESULTS, read_json, read_made
 from oodil.pipeline.errors import DataError
 
 Number = int | float
@@ -110,34 +109,10 @@ class Records(Held):
 def read_records(folder: Path) -> Records:
     """Return the records of an experiment's folder. Raises DataError for a file that is not as described."""
     path = folder / RESULTS
-    values = _read(path, dict)
+    values = read_json(path, dict)
     try:
         return Records.model_validate(values | {"made": read_made(folder)})
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))
         raise DataError(f"{path}: {key + ': ' if key else ''}{first['msg'].removeprefix('Value error, ')}") from None
-
-
-def read_made(folder: Path) -> list[dict[str, Any]]:
-    """Return what is known of each command that computed a part; none if the file is not there.
-
-    Raises DataError for a file that is not as described.
-    """
-    path = folder / MADE
-    made = _read(path, list) if path.is_file() else []
-    if not all(isinstance(each, dict) and isinstance(each.get("seconds"), dict) for each in made):
-        raise DataError(f"{path}: every entry needs the seconds of each run")
-    return made
-
-
-def _read(path: Path, kind: type[Any]) -> Any:
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror or error}") from error
-    except ValueError as error:
-        raise DataError(f"{path}: not valid JSON: {error}") from error
-    if not isinstance(values, kind):
-        raise DataError(f"{path}: expected a {kind.__name__}, found a {type(values).__name__}")
-    return values
