@@ -16,7 +16,8 @@ from oodil.pipeline.errors import DataError
 from oodil.pipeline.report.table import Table, read_table, write_table
 from oodil.pipeline.report.table.figures import curve_over_seeds, method_looks, plots
 from oodil.pipeline.report.table.grids import findings, grids, notes
-from oodil.pipeline.report.table.texts import explained, how_made, latex, main_table, markdown, over_seeds
+from oodil.pipeline.report.table.making import Making, making
+from oodil.pipeline.report.table.texts import explained, latex, main_table, markdown, over_seeds
 
 ROOT = Path(__file__).parents[2]
 MADE_UP = ROOT / "tests" / "made_up_table"
@@ -110,16 +111,20 @@ def test_what_is_better_is_counted_and_what_is_not_there_is_said():
     ]
     assert list(notes(table)) == [
         "Failed: 1:9, ours, seed 24: OSError: No space left on device",
-        "Not there yet: 1:9, naive GAIL, seeds 23, 24",
+        "Not there yet: 1:9; naive GAIL; seeds 23, 24",
     ]
 
 
-def test_methods_of_which_the_same_is_missing_are_named_together(folder: Path):
+def test_methods_and_rows_of_which_the_same_is_missing_are_named_together(folder: Path):
     missing = [["1:9", method, seed] for method in ("naive_gail", "imitation") for seed in (24, 23)]
     table = changed(folder, failed=[], missing=[*missing, ["1:9", "oracle", 23]])
     assert list(notes(table)) == [
-        "Not there yet: 1:9, naive GAIL, ours, seeds 23, 24",
-        "Not there yet: 1:9, oracle, seed 23",
+        "Not there yet: 1:9; naive GAIL, ours; seeds 23, 24",
+        "Not there yet: 1:9; oracle; seed 23",
+    ]
+    missing = [[row, method, 20] for row in ("1:1", "1:9") for method in ("naive_gail", "imitation", "oracle")]
+    assert list(notes(changed(folder, cells=[], failed=[], missing=missing))) == [
+        "Not there yet: 1:1, 1:9; all methods; seed 20"
     ]
 
 
@@ -136,14 +141,23 @@ def test_without_published_figures_the_best_of_a_row_is_marked(folder: Path):
     assert shorter.marked == {("1:1", "imitation"): "published"}, "the smaller distance is the better one"
 
 
-def test_how_it_was_made_is_one_line():
-    (made,) = read_table(MADE_UP).records.made
-    assert how_made(made) == (
-        "command: oodil table made-up --seeds 20-24; machine: cores 2, cpu none; "
-        "raw hopper steps per second: 12,100.4; "
-        "2 runs of 1\u00a0min 30\u00a0s on average, 3\u00a0min 00\u00a0s in all; versions: torch 0.0"
+def test_what_commands_have_in_common_is_said_once():
+    made = read_table(MADE_UP).records.made
+    command = "oodil table made-up --seeds 20-24"
+    took = "2 runs of 1\u00a0min 30\u00a0s on average, 3\u00a0min 00\u00a0s in all"
+    assert making(made) == Making(
+        f"cores: 2; cpu: none; raw hopper steps per second: 12,100; took: {took}; versions: torch 0.0",
+        ((command, ""),),
     )
-    assert how_made({}) == how_made({"command": None, "seconds": {}}) == ""
+    later = {**made[0], "command": ["oodil", "table"], "machine": {"cores": 2, "cpu": "other"}, "seconds": {"a": 60}}
+    both = making((*made, later, later | {"seconds": {}}))
+    assert both.shared == "cores: 2; raw hopper steps per second: 12,100; versions: torch 0.0"
+    assert both.commands == (
+        (command, f"cpu: none; took: {took}"),
+        ("oodil table", "cpu: other; took: 1 run, 1\u00a0min 00\u00a0s"),
+        ("oodil table", "cpu: other"),
+    )
+    assert making(()) == Making("", ())
 
 
 def test_the_page_stands_alone_and_follows_the_readers_mode(folder: Path):
@@ -251,7 +265,7 @@ def test_the_oracle_is_dashed_and_ours_comes_first():
 def test_a_table_of_one_unfinished_run_is_a_page_too(folder: Path):
     table = changed(folder, cells=[], failed=[], missing=[["1:1", "imitation", 20]], published={})
     assert not plots(table) and not grids(table) and not list(findings(table))
-    assert "Not there yet: 1:1, ours, seed 20" in write_table(folder).read_text(encoding="utf-8")
+    assert "Not there yet: 1:1; ours; seed 20" in write_table(folder).read_text(encoding="utf-8")
     cells = json.loads((MADE_UP / "results.json").read_text())["cells"][:1]
     changed(folder, cells=cells, published={"1:9": {"oracle": 7}})
     (folder / "made.json").unlink()

@@ -1,5 +1,6 @@
 """The tables below the table, the same on the page and in Markdown: head, rows of text, and what they mean."""
 
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -154,15 +155,20 @@ def notes(table: Table) -> Iterator[str]:
     for failure in records.failed:
         what = f"{records.methods.get(failure.method, failure.method)}, " if failure.method else ""
         yield f"Failed: {failure.row}, {what}seed {failure.seed}: {failure.reason}"
-    places: dict[tuple[str, str], list[int]] = {}
+    seeds: dict[tuple[str, str], list[int]] = defaultdict(list)
     for row, method, seed in records.missing:
-        places.setdefault((row, method), []).append(seed)
-    alike: dict[tuple[str, str], list[str]] = {}
-    for (row, method), seeds in places.items():
-        listed = f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, sorted(seeds)))}"
-        alike.setdefault((row, listed), []).append(records.methods.get(method, method))
-    for (row, listed), methods in alike.items():
-        yield f"Not there yet: {row}, {', '.join(methods)}, {listed}"
+        seeds[row, method].append(seed)
+    methods: dict[tuple[str, tuple[int, ...]], list[str]] = defaultdict(list)
+    for (row, method), each in seeds.items():
+        methods[row, tuple(sorted(each))].append(method)
+    rows: dict[tuple[tuple[str, ...], tuple[int, ...]], list[str]] = defaultdict(list)
+    for (row, lacking), columns in methods.items():
+        rows[tuple(columns), lacking].append(row)
+    for (named, lacking), alike in rows.items():
+        titles = ", ".join(records.methods[method] for method in named)
+        what = "all methods" if len(named) == len(records.methods) > 1 else titles
+        listed = f"seed{'s' * (len(lacking) > 1)} {', '.join(map(str, lacking))}"
+        yield f"Not there yet: {', '.join(alike)}; {what}; {listed}"
 
 
 def findings(table: Table) -> Iterator[str]:

@@ -8,8 +8,9 @@ from oodil.pipeline.report import formats
 from oodil.pipeline.report.pages import page
 from oodil.pipeline.report.table.figures import method_looks, plots
 from oodil.pipeline.report.table.grids import Grid, findings, grids, notes
+from oodil.pipeline.report.table.making import Making, making
 from oodil.pipeline.report.table.summary import Table
-from oodil.pipeline.report.table.texts import deviation, explained, how_made, mean, over_seeds
+from oodil.pipeline.report.table.texts import deviation, explained, mean, over_seeds
 
 CAPTIONS = {
     "seeds": "Every point is a seed. A stroke is the mean, a bar the interval of the interquartile mean, or one "
@@ -69,7 +70,7 @@ class TablePage:
     rows: tuple[tuple[str, tuple[Shown, ...]], ...]
     panels: tuple[Panels, ...]
     grids: tuple[Grid, ...]
-    made: tuple[str, ...]
+    made: Making
 
 
 def context(table: Table) -> TablePage:
@@ -115,7 +116,7 @@ def context(table: Table) -> TablePage:
             for plot in plots(table)
         ),
         grids=grids(table),
-        made=tuple(how_made(each) for each in records.made),
+        made=making(records.made),
     )
 
 

@@ -3,12 +3,11 @@
 import csv
 import io
 import re
-import shlex
 from collections.abc import Sequence
-from typing import Any
 
 from oodil.pipeline.report import formats
 from oodil.pipeline.report.table.grids import Grid, findings, grids, notes
+from oodil.pipeline.report.table.making import making
 from oodil.pipeline.report.table.summary import MEASURES, Entry, Table
 
 COLUMNS = ("mean_return", "std_return", *(name for name in MEASURES if name != "mean_return"))
@@ -56,34 +55,6 @@ def explained(table: Table) -> str:
     return said + f"In parentheses: the published figure{source}. Marked: the better of the two."
 
 
-def how_made(made: dict[str, Any]) -> str:
-    """Return one line on what is known of a command that made a part of the table; nothing where nothing is."""
-    parts = []
-    for key, value in made.items():
-        if key == "command" and isinstance(value, list):
-            value = shlex.join(map(str, value))
-        name = re.sub(r" per s$", " per second", key.replace("_", " "))
-        if isinstance(value, dict) and "seconds" in key and value and all(_is_number(each) for each in value.values()):
-            total = sum(value.values())
-            each = formats.duration(total / len(value))
-            parts.append(f"{formats.plural(len(value), 'run')} of {each} on average, {formats.duration(total)} in all")
-        elif value not in (None, "", {}, []):
-            parts.append(f"{name}: {_plain(value)}")
-    return "; ".join(parts)
-
-
-def _plain(value: Any) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{key.replace('_', ' ')} {_plain(each)}" for key, each in value.items())
-    if isinstance(value, list):
-        return ", ".join(map(_plain, value))
-    return f"{value:,.6g}" if _is_number(value) else str(value)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def markdown(table: Table, level: int = 1, below: str = "") -> str:
     """Return the whole of the table's page that is not a figure.
 
@@ -101,7 +72,10 @@ def markdown(table: Table, level: int = 1, below: str = "") -> str:
     parts.append(lines(head, [(row, *(over_seeds(table, e) for e in _entries(table, row))) for row in records.rows]))
     for grid in grids(table):
         parts += [f"{heading}# {grid.title}", _escaped(grid.caption), grid_table(grid)]
-    parts += [f"Made with: {_escaped(how_made(each))}." for each in records.made]
+    made = making(records.made)
+    if made.commands:
+        parts += [f"{heading}# How it was made", _escaped(made.shared and f"Each command: {made.shared}.")]
+        parts.append("\n".join(f"* `{command}` {_escaped(facts)}".rstrip() for command, facts in made.commands))
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
