@@ -33,6 +33,8 @@ from oodil.pipeline.stages.demonstrations import load_demonstrations, transferab
 from oodil.pipeline.suggestion import Suggestion, suggest
 from oodil.pipeline.verdicts import VerdictTable
 
+SPENDING = "stage_finished", "stage_interrupted"
+"""Events that say how long a stage took, or a part of it."""
 POWERS = 1, 2, 4, 8
 """Of the scores, for comparison: what weights would have been without a rule of what is kept."""
 
@@ -212,11 +214,16 @@ class RunResults:
                 continue
             if event.get("event") == "stage_started" and stage in finished and event.get("jobs") != 0:
                 spent[stage] = 0.0
-            if event.get("event") in ("stage_finished", "stage_interrupted") and isinstance(seconds, int | float):
+            if event.get("event") in SPENDING and isinstance(seconds, int | float):
                 spent[stage] = spent.get(stage, 0.0) + float(seconds)
             if event.get("event") == "stage_finished":
                 finished.add(stage)
         return {stage: seconds for stage, seconds in spent.items() if stage in finished}
+
+    def seconds_ever(self) -> float:
+        """Return how long all stages took, with what was interrupted and what was computed again since."""
+        told = [event.get("seconds") for event in _events(self.run) if event.get("event") in SPENDING]
+        return sum(float(seconds) for seconds in told if isinstance(seconds, int | float))
 
     def summary(self) -> dict[str, Any]:
         """Return the results known so far, as JSON values.

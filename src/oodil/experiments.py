@@ -138,11 +138,11 @@ class Table:
     def write_made(self, command: Sequence[str]) -> Path:
         """Add to how it was made: by which command, on what machine, how fast; return the file.
 
-        Seconds are of the stages that were finished since the last command that is there. One that finished none is
-        left out.
+        Seconds are those that were spent on stages since the last command that is there. One that spent none is left
+        out.
         """
         path, earlier = self.folder / MADE, read_made(self.folder)
-        spent = {run.name: sum(RunResults(self.opened(run)).seconds().values()) for run in self.runs}
+        spent = {run.name: RunResults(self.opened(run)).seconds_ever() for run in self.runs}
         for each in earlier:
             for name, seconds in each["seconds"].items():
                 spent[name] = spent.get(name, 0) - seconds

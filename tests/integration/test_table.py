@@ -1,6 +1,7 @@
 """A table is the same bytes whatever happens on the way, with real processes and real signals."""
 
 import json
+import shutil
 import signal
 from pathlib import Path
 
@@ -65,6 +66,16 @@ def test_an_unchanged_table_computes_nothing(whole: Path) -> None:
     table.write_made(["table"])  # A command that was stopped before it had finished a stage.
     assert [path.read_bytes() for path in kept] == contents
     assert {name: artifacts(whole / name) for name in RUNS} == before
+
+
+def test_what_is_computed_again_is_in_how_it_was_made(whole: Path, tmp_path: Path) -> None:
+    write_experiment(tmp_path)
+    shutil.copytree(whole, tmp_path / "micro")
+    shutil.rmtree(tmp_path / "micro" / "all-seed1" / "stages" / "imitation")
+    run(*command(tmp_path, 1))
+    earlier, again = json.loads((tmp_path / "micro" / "made.json").read_bytes())
+    assert [earlier] == json.loads((whole / "made.json").read_bytes())
+    assert again["seconds"].keys() == {"all-seed1"}
 
 
 @pytest.mark.parametrize(

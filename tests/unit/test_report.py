@@ -633,6 +633,7 @@ def test_stage_times_are_those_of_the_last_computation(tmp_path: Path) -> None:
     ]
     run.directory.events.write_text("\n".join(map(json.dumps, lines)))
     assert RunResults(run).seconds() == {"clustering": 50.0, "transferability": 300.5, "imitation": 70.0}
+    assert RunResults(run).seconds_ever() == 20 + 30 + 300 + 0.5 + 90 + 70 + 5
 
 
 DRIVING: dict[str, Any] = {"id": "oodil/Driving-v0", "dynamics": {"obstacle_1": 0.3, "obstacle_2": 0.2, "speed": 1.0}}
