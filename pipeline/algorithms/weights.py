@@ -74,11 +74,15 @@ def kept_weights(scores: Array, intervals: Array, threshold: float) -> Array:
     return np.asarray(scored / max(scored.sum(), 1))
 
 
-def intervals(readings: Array) -> Array:
-    """Return (N, 2) intervals of (R, N) scores: two standard errors around the mean; [0, 1] with one reading."""
+def intervals(readings: Array, seen: NDArray[np.bool_]) -> Array:
+    """Return (N, 2) intervals of (R, N) scores: two standard errors around the mean; [0, 1] with one reading.
+
+    So it is as well for those (N,) that were ``seen``: what read them was trained on them.
+    """
     spread = (
         2 * readings.std(axis=0, ddof=1) / len(readings) ** 0.5 if len(readings) > 1 else np.ones(readings.shape[1])
     )
+    spread[seen] = 1
     middle = readings.mean(axis=0)
     return np.clip(np.stack((middle - spread, middle + spread), axis=1), 0, 1)
 

@@ -46,7 +46,7 @@ class TransferabilityStage(Weighting):
 
     name = "transferability"
     title = "ours"
-    version = 5
+    version = 6
     inputs = ("demonstrations", "clustering", "imitators")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
@@ -121,9 +121,8 @@ class TransferabilityStage(Weighting):
         labels = load_assignment(run).labels
         readings = self._readings(run.config, demonstrations, divergences)
         threshold = section.kept_from * best_mode(readings, labels, section.kept_from)
-        found = self._judged(run.config, readings, labels, threshold)
-        if fresh:
-            found.intervals[np.bincount(labels)[labels] == 1] = 0, 1  # Its readers have seen it, and there is no other.
+        # The readers of a demonstration that is alone in its cluster have seen it: there are no halves.
+        found = self._judged(run.config, readings, labels, threshold, seen=np.bincount(labels)[labels] == 1)
         return replace(found, env_steps=env_steps, read_from=read_from, history=history).files()
 
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
@@ -154,7 +153,8 @@ class TransferabilityStage(Weighting):
             unlike[new] = around.unlike(chosen, labeled.features[new])
         readings = self._readings(run.config, demonstrations, divergences)
         readings[:, unlike] = np.nan
-        return self._judged(run.config, readings, labels, self.load(run).threshold)
+        seen = np.zeros(len(demonstrations), np.bool_)
+        return self._judged(run.config, readings, labels, self.load(run).threshold, seen)
 
     def _by_cluster(self, run: Run) -> dict[int, list[str]]:
         """Return the jobs of each cluster that has demonstrations."""
@@ -172,10 +172,12 @@ class TransferabilityStage(Weighting):
         horizon = environment_spec(environment.id, environment.dynamics).max_episode_steps
         return transferability_of_divergences(divergences) * share_lasted(demonstrations, horizon)
 
-    def _judged(self, config: RunConfig, readings: np.ndarray, labels: np.ndarray, threshold: float) -> Transferability:
+    def _judged(
+        self, config: RunConfig, readings: np.ndarray, labels: np.ndarray, threshold: float, seen: NDArray[np.bool_]
+    ) -> Transferability:
         scores = readings.mean(axis=0)
         single = config.transferability.reading.discriminator == "last"
-        limits = np.stack((scores, scores), axis=1) if single else intervals(readings)
+        limits = np.stack((scores, scores), axis=1) if single else intervals(readings, seen)
         return Transferability(scores, kept_weights(scores, limits, threshold), labels, limits, threshold)
 
 

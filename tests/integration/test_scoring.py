@@ -171,3 +171,15 @@ def test_a_run_without_the_stage(results: oodil.RunResults, file: Path, tmp_path
     assert "transferability is partial" in refused(tmp_path / "run", file)
     oodil.run(MICRO, workers=0, run_dir=tmp_path / "begun", until="demonstrations")
     assert "transferability is pending" in refused(tmp_path / "begun", file)
+
+
+def test_a_demonstration_alone_in_its_cluster_is_open_and_weighs_nothing(tmp_path: Path) -> None:
+    """Its readers have seen it, so that whatever they say of it is uncertain."""
+    short = ["transferability.gail.total_steps=1200", "imitation.gail.total_steps=1200", "evaluation.num_points=0"]
+    clusters = ["clustering.features=states", "clustering.num_clusters=5"]
+    found = oodil.run(MICRO, [*short, *clusters], workers=0, run_dir=tmp_path / "run").transferability
+    alone = np.bincount(found.clusters)[found.clusters] == 1
+    assert alone.any() and not alone.all()
+    np.testing.assert_array_equal(found.intervals[alone], [[0, 1]] * alone.sum())
+    assert set(found.verdicts[alone]) == {"open"} and not found.weights[alone].any()
+    assert (found.verdicts[found.weights > 0] == "kept").all()

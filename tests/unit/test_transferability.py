@@ -77,12 +77,14 @@ def test_a_single_demonstration_is_a_mode_where_there_is_no_other():
     assert best_mode(readings, np.zeros(3, np.int32), 0.5) == pytest.approx(0.9)
 
 
-def test_an_interval_is_two_errors_around_the_mean_and_everything_with_one_reading():
+def test_an_interval_is_two_errors_around_the_mean_and_everything_where_that_is_not_known():
     readings = np.array([[0.5, 0.9, 0.0], [0.3, 0.9, 0.1]])
     spread = 2 * np.sqrt(0.02 / 2)
     expected = [[0.4 - spread, 0.4 + spread], [0.9, 0.9], [0, 0.05 + spread / 2]]
-    np.testing.assert_allclose(intervals(readings), expected)
-    np.testing.assert_allclose(intervals(readings[:1]), [[0, 1]] * 3)
+    seen = np.array([False, True, False])
+    np.testing.assert_allclose(intervals(readings, ~seen & seen), expected)
+    np.testing.assert_allclose(intervals(readings, seen), [expected[0], [0, 1], expected[2]])
+    np.testing.assert_allclose(intervals(readings[:1], ~seen & seen), [[0, 1]] * 3)
 
 
 def test_verdicts_follow_from_the_interval():
