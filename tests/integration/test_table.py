@@ -71,7 +71,8 @@ def test_an_unchanged_table_computes_nothing(whole: Path) -> None:
 def test_what_is_computed_again_is_in_how_it_was_made(whole: Path, tmp_path: Path) -> None:
     write_experiment(tmp_path)
     shutil.copytree(whole, tmp_path / "micro")
-    shutil.rmtree(tmp_path / "micro" / "all-seed1" / "stages" / "imitation")
+    for finished in ("stages", "jobs"):
+        shutil.rmtree(tmp_path / "micro" / "all-seed1" / finished / "imitation")
     run(*command(tmp_path, 1))
     earlier, again = json.loads((tmp_path / "micro" / "made.json").read_bytes())
     assert [earlier] == json.loads((whole / "made.json").read_bytes())
