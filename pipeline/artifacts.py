@@ -73,9 +73,22 @@ def read_made(folder: Path) -> list[dict[str, Any]]:
     """
     path = folder / MADE
     made = read_json(path, list) if path.is_file() else []
-    if not all(isinstance(each, dict) and isinstance(each.get("seconds"), dict) for each in made):
-        raise DataError(f"{path}: every entry needs the seconds of each run")
+    if not all(map(_tells_a_command, made)):
+        raise DataError(
+            f"{path}: every entry needs the seconds of each run; a command is a list of words, a machine an object"
+        )
     return made
+
+
+def _tells_a_command(entry: Any) -> bool:
+    return (
+        isinstance(entry, dict)
+        and isinstance(command := entry.get("command", []), list)
+        and all(isinstance(word, str) for word in command)
+        and isinstance(entry.get("machine", {}), dict)
+        and isinstance(entry.get("seconds"), dict)
+        and all(isinstance(seconds, int | float) for seconds in entry["seconds"].values())
+    )
 
 
 def _finite(value: Any) -> Any:

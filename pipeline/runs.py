@@ -33,8 +33,6 @@ from oodil.pipeline.stages.demonstrations import load_demonstrations, transferab
 from oodil.pipeline.suggestion import Suggestion, suggest
 from oodil.pipeline.verdicts import VerdictTable
 
-SPENDING = "stage_finished", "stage_interrupted"
-"""Events that say how long a stage took, or a part of it."""
 POWERS = 1, 2, 4, 8
 """Of the scores, for comparison: what weights would have been without a rule of what is kept."""
 
@@ -209,21 +207,19 @@ class RunResults:
         spent: dict[str, float] = {}
         finished: set[str] = set()
         for event in _events(self.run):
-            stage, seconds = event.get("stage"), event.get("seconds")
+            stage = event.get("stage")
             if not isinstance(stage, str):
                 continue
             if event.get("event") == "stage_started" and stage in finished and event.get("jobs") != 0:
                 spent[stage] = 0.0
-            if event.get("event") in SPENDING and isinstance(seconds, int | float):
-                spent[stage] = spent.get(stage, 0.0) + float(seconds)
+            spent[stage] = spent.get(stage, 0.0) + _spent(event)
             if event.get("event") == "stage_finished":
                 finished.add(stage)
         return {stage: seconds for stage, seconds in spent.items() if stage in finished}
 
     def seconds_ever(self) -> float:
         """Return how long all stages took, with what was interrupted and what was computed again since."""
-        told = [event.get("seconds") for event in _events(self.run) if event.get("event") in SPENDING]
-        return sum(float(seconds) for seconds in told if isinstance(seconds, int | float))
+        return sum(map(_spent, _events(self.run)))
 
     def summary(self) -> dict[str, Any]:
         """Return the results known so far, as JSON values.
@@ -312,6 +308,12 @@ def separation_metrics(
 def shown_return(value: float) -> str:
     """Return an episode return in the digits that it deserves."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def _spent(event: dict[str, Any]) -> float:
+    """Return the seconds that a stage took up to its end or to a stop, if that is what an event tells."""
+    seconds = event.get("seconds") if event.get("event") in ("stage_finished", "stage_interrupted") else None
+    return float(seconds) if isinstance(seconds, int | float) else 0.0
 
 
 def _events(run: Run) -> list[dict[str, Any]]:

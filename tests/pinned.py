@@ -45,9 +45,9 @@ def hashes(results: oodil.RunResults) -> dict[str, str]:
     return {name: entry["sha256"] for name, entry in described.items()}
 
 
-def pinned() -> dict[str, dict[str, dict[str, int | str]]]:
-    """Return what is held: by platform and stage, version and sha256."""
-    held: dict[str, dict[str, dict[str, int | str]]] = json.loads(FILE.read_text())
+def pinned() -> dict[str, dict[str, dict[str, int | str | None]]]:
+    """Return what is held: by platform and stage, version and sha256; null until such a machine was at hand."""
+    held: dict[str, dict[str, dict[str, int | str | None]]] = json.loads(FILE.read_text())
     return held
 
 

@@ -31,7 +31,10 @@ def test_code_that_changes_bits_comes_with_a_raised_version(checkout: oodil.RunR
         pytest.skip(f"no hashes for {pinned.platform_name()}; `python -m tests.pinned` adds this machine's")
     versions, made = pinned.versions(), pinned.hashes(checkout)
     assert held.keys() == made.keys(), "the smoke run has other stages; `python -m tests.pinned` writes its hashes"
+    unknown = [stage for stage in made if held[stage]["sha256"] is None]
     for stage, sha256 in made.items():
+        if stage in unknown:
+            continue
         if held[stage]["version"] == versions[stage]:
             assert held[stage]["sha256"] == sha256, (
                 f"{stage} gives other bits under the same version {versions[stage]}: artifacts of older code would be "
@@ -40,6 +43,8 @@ def test_code_that_changes_bits_comes_with_a_raised_version(checkout: oodil.RunR
             )
         else:
             assert held[stage]["sha256"] == sha256, f"{stage} has a new version; run `python -m tests.pinned`"
+    if unknown:
+        pytest.skip(f"no hashes of {', '.join(unknown)}; `python -m tests.pinned` adds this machine's")
 
 
 @pytest.fixture(scope="module")

@@ -146,15 +146,15 @@ def test_what_commands_have_in_common_is_said_once():
     command = "oodil table made-up --seeds 20-24"
     took = "2 runs of 1\u00a0min 30\u00a0s on average, 3\u00a0min 00\u00a0s in all"
     assert making(made) == Making(
-        f"cores: 2; cpu: none; raw hopper steps per second: 12,100; took: {took}; versions: torch 0.0",
+        f"Each command: cores: 2; cpu: none; raw hopper steps per second: 12,100; took: {took}; versions: torch 0.0.",
         ((command, ""),),
     )
     later = {**made[0], "command": ["oodil", "table"], "machine": {"cores": 2, "cpu": "other"}, "seconds": {"a": 60}}
     both = making((*made, later, later | {"seconds": {}}))
-    assert both.shared == "cores: 2; raw hopper steps per second: 12,100; versions: torch 0.0"
+    assert both.shared == "Each command: cores: 2; raw hopper steps per second: 12,100; versions: torch 0.0."
     assert both.commands == (
         (command, f"cpu: none; took: {took}"),
-        ("oodil table", "cpu: other; took: 1 run, 1\u00a0min 00\u00a0s"),
+        ("oodil table", "cpu: other; took: 1 run of 1\u00a0min 00\u00a0s"),
         ("oodil table", "cpu: other"),
     )
     assert making(()) == Making("", ())
@@ -300,7 +300,16 @@ def test_a_folder_without_records_is_refused(tmp_path: Path):
         write_table(tmp_path)
 
 
-@pytest.mark.parametrize(("text", "message"), [("{}", "expected a list"), ("[{}]", "every entry needs the seconds")])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{}", "expected a list"),
+        ("[{}]", "every entry needs the seconds"),
+        ('[{"seconds": {"a": "1"}}]', "every entry needs the seconds"),
+        ('[{"seconds": {}, "command": null}]', "every entry .* a command is a list"),
+        ('[{"seconds": {}, "machine": "x"}]', "every entry .* a machine an object"),
+    ],
+)
 def test_what_is_known_of_its_making_is_as_described(folder: Path, text: str, message: str):
     (folder / "made.json").write_text(text)
     with pytest.raises(DataError, match=f"{re.escape(str(folder / 'made.json'))}: {message}"):

@@ -74,8 +74,12 @@ def markdown(table: Table, level: int = 1, below: str = "") -> str:
         parts += [f"{heading}# {grid.title}", _escaped(grid.caption), grid_table(grid)]
     made = making(records.made)
     if made.commands:
-        parts += [f"{heading}# How it was made", _escaped(made.shared and f"Each command: {made.shared}.")]
-        parts.append("\n".join(f"* `{command}` {_escaped(facts)}".rstrip() for command, facts in made.commands))
+        parts += [f"{heading}# How it was made", _escaped(made.shared)]
+        parts.append(
+            "\n".join(
+                f"* {f'`{command}` ' * bool(command)}{_escaped(facts)}".rstrip() for command, facts in made.commands
+            )
+        )
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
