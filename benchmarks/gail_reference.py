@@ -1,7 +1,8 @@
 """How much experience GAIL needs from one reproducible source, in every environment, with one setting for all.
 
 For every seed: the true return of mean and of sampled actions along the training, environment steps until mean actions
-first reach the task's target, and the share of final episodes that reach it. Constants are chosen with ``--dynamics
+first reach the task's target, and the share of episodes of the policy that a run would keep (`Candidates`), and of the
+last one, that reach it. Constants are chosen with ``--dynamics
 choosing``, imitators that no table uses, and reported with ``--dynamics reported``. ``--set KEY=VALUE`` changes a field
 of the training, such as ``discriminator.gradient_penalty=0`` or ``policy_optimizer.kind=ppo``. What ``--json FILE``
 has already is not trained again; remove it when the code has changed.
@@ -24,7 +25,8 @@ from numpy.typing import NDArray
 
 from oodil.pipeline.algorithms.gail import imitator
 from oodil.pipeline.artifacts import encode_arrays
-from oodil.pipeline.config import EnvironmentConfig, GailConfig
+from oodil.pipeline.candidates import Candidates
+from oodil.pipeline.config import EnvironmentConfig, GailConfig, ImitationConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import environment_spec
 from oodil.pipeline.evaluation import evaluate
@@ -37,6 +39,7 @@ from oodil.pipeline.training import Probe, train
 EXPERTS = Path(__file__).parents[1] / "configs" / "experts"
 CURVE_POINTS = 28
 CURVE_EPISODES, FINAL_EPISODES = 8, 100
+NUM_CANDIDATES = ImitationConfig.model_fields["num_candidates"].default
 
 
 @dataclass(frozen=True)
@@ -126,10 +129,14 @@ def run_seed(name: str, dynamics: str, seed: int, config: GailConfig, keep: Path
         return np.array([mean.mean_return, sampled.mean_return, float(np.exp(policy.log_std).mean())])
 
     environment = EnvironmentConfig(id=task.env_id, dynamics={**target})
-    history = train(learner, environment, config, [Probe("return", CURVE_POINTS, measure)], Quiet(), UNUSED)
+    candidates = Candidates(learner, environment, NUM_CANDIDATES)
+    probes = [Probe("return", CURVE_POINTS, measure), candidates.probe]
+    history = train(learner, environment, config, probes, Quiet(), UNUSED)
     seconds = time.perf_counter() - started - measuring
     steps, curve = history.steps("return"), history.values("return")
     reached = np.flatnonzero(curve[:, 0] >= task.target)
+    last = evaluate(learner.behavior_policy(), task.env_id, target, FINAL_EPISODES, key)
+    kept_after = candidates.keep_closest(history)
     policy = learner.behavior_policy()
     final = evaluate(policy, task.env_id, target, FINAL_EPISODES, key)
     if keep:
@@ -143,6 +150,8 @@ def run_seed(name: str, dynamics: str, seed: int, config: GailConfig, keep: Path
         "target": task.target,
         "demonstrations_return": float(demonstrations.returns.mean()),
         "steps_to_target": int(steps[reached[0]]) if reached.size else None,
+        "kept_after": kept_after,
+        "last_return": last.mean_return,
         "final_return": final.mean_return,
         "final_share": float((final.returns >= task.target).mean()),
         "sampled_return": float(curve[-1, 1]),

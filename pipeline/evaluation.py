@@ -12,13 +12,13 @@ from oodil.pipeline.data import Episode
 from oodil.pipeline.environments import Simulators, make_batch
 from oodil.pipeline.policy import Controller, GaussianPolicy
 from oodil.pipeline.results import Evaluation
-from oodil.pipeline.seeding import Key, derive_key, numpy_rng
+from oodil.pipeline.seeding import Key, numpy_rng
 
 if TYPE_CHECKING:
     from oodil.pipeline.algorithms.gail import AdversarialReward
 
 DISTANCE_EPISODES = 16
-"""Mean-action episodes that a policy's distance to demonstrations is measured with."""
+"""Mean-action episodes that the distance of a finished policy to demonstrations is measured with."""
 
 
 def run_episodes(
@@ -71,10 +71,10 @@ def distance_of(
     policy: GaussianPolicy,
     reward: "AdversarialReward",
     environment: EnvironmentConfig,
-    seed: int,
+    episodes: int,
+    key: Key,
     starts: NDArray[np.float32] | None = None,
 ) -> float:
     """Return how far fresh episodes of mean actions are from the demonstrations that a reward model was made for."""
-    simulators = make_batch(environment.id, environment.dynamics, DISTANCE_EPISODES)
-    rng = numpy_rng(derive_key(seed, "distance"))
-    return reward.distance(run_episodes(simulators, policy, rng, stochastic=False, starts=starts))
+    simulators = make_batch(environment.id, environment.dynamics, episodes)
+    return reward.distance(run_episodes(simulators, policy, numpy_rng(key), stochastic=False, starts=starts))

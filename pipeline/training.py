@@ -35,10 +35,14 @@ class Probe:
     """Number of measurements, evenly spaced; the last one follows the last iteration."""
     measure: Callable[[], NDArray]
     """Returns an array of fixed shape."""
+    second_half: bool = False
+    """Whether all of them are made in the second half of the training."""
 
     def is_due(self, iteration: int, num_iterations: int) -> bool:
         """Return whether to measure after this iteration."""
-        return (iteration + 1) * self.count // num_iterations > iteration * self.count // num_iterations
+        skipped = num_iterations // 2 if self.second_half else 0
+        done, num_parts = iteration - skipped, num_iterations - skipped
+        return done >= 0 and (done + 1) * self.count // num_parts > done * self.count // num_parts
 
 
 class History:

@@ -173,8 +173,9 @@ class Writer:
             action_high=np.ones(3, np.float32),
             env_steps=env_steps,
         )
-        kept = Training("training-2", env_steps, 0.2, final.mean_return)
-        other = Training("training-1", env_steps, 0.3, 2 * final.mean_return)  # no return decides which is kept
+        kept = Training("training-2", env_steps, env_steps, 0.2, final.mean_return)
+        # No return decides which is kept.
+        other = Training("training-1", env_steps, env_steps * 3 // 4, 0.3, 2 * final.mean_return)
         self.write(stage, policy.files() | curve.files() | final.files() | Trainings((kept, other)).files())
 
     def steps(self) -> dict[str, Callable[[], None]]:

@@ -113,6 +113,9 @@ class ImitationConfig(Section):
     num_trainings: PositiveInt = 2
     """Trainings, each with a seed of its own; the policy whose transitions come closest to the weighted demonstrations'
     is kept. They run side by side where there are no more workers than trainings."""
+    num_candidates: PositiveInt = 8
+    """Points in the second half of a training at which its mean actions are compared with the weighted demonstrations;
+    the closest is what the training gives. The last of them is the end; with 1 it is the only one, as in the paper."""
 
 
 class FinetuningConfig(Section):

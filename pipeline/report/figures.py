@@ -34,6 +34,8 @@ class PolicyResult:
     title: str
     curve: LearningCurve | None
     final: Evaluation | None
+    kept_after: int | None
+    """Environment steps after which it was what is kept of its training."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,8 @@ def embedding(
 def learning(policies: list[PolicyResult]) -> Markup:
     """Draw true returns over environment steps, with a band of one standard deviation over episodes.
 
-    A policy without a curve is a line at its final return. Policies without finite returns are left out.
+    A star marks what is kept of a training, at its final return. A policy without a curve is a line there. Policies
+    without finite returns are left out.
     """
     with drawing("learning", 11, 3.7) as (figure, svg):
         axes = figure.subplots()
@@ -120,6 +123,8 @@ def learning(policies: list[PolicyResult]) -> Markup:
                 )  # fmt: skip
                 ends.append((float(curve.mean_return[np.isfinite(curve.mean_return)][-1]), policy.title, color))
                 last_step = max(last_step, int(curve.env_steps[-1]))
+                if policy.final is not None and policy.kept_after is not None:
+                    axes.plot(policy.kept_after, policy.final.mean_return, "*", color=color, markersize=13)
             elif policy.final is not None and np.isfinite(policy.final.mean_return):
                 axes.axhline(policy.final.mean_return, color=color, linewidth=width, linestyle=dashes)
                 ends.append((policy.final.mean_return, policy.title, color))

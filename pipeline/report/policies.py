@@ -31,6 +31,7 @@ class TrainingRow:
     """Its title."""
     name: str
     kept: bool
+    kept_after: int
     distance: str
     mean_return: float
 
@@ -56,7 +57,8 @@ def read_policies(found: Findings) -> PolicySection | None:
     for policy in results.policies:
         final = found.finals.get(policy.name)
         curve = results.curve(policy.name) if final else None
-        drawn.append(PolicyResult(policy.title, curve if curve and len(curve.env_steps) else None, final))
+        kept_after = results.trainings(policy.name).trainings[0].kept_after if final else None
+        drawn.append(PolicyResult(policy.title, curve if curve and len(curve.env_steps) else None, final, kept_after))
         row = PolicyRow(
             title=policy.title,
             weighting=found.title(policy.weighting) if policy.weighting else "",
@@ -81,6 +83,7 @@ def _trainings(found: Findings, policy: str) -> list[TrainingRow]:
             policy=found.title(policy),
             name=training.job.replace("-", " "),
             kept=training is held[0],
+            kept_after=training.kept_after,
             distance=formats.decimal(training.distance),
             mean_return=training.mean_return,
         )

@@ -27,6 +27,8 @@ class Training:
 
     job: str
     env_steps: int
+    kept_after: int
+    """Environment steps after which its policy was what is kept of it."""
     distance: float
     """Of mean-action episodes to the weighted demonstrations, see `AdversarialReward.distance`; the smallest counts."""
     mean_return: float

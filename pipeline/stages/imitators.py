@@ -13,7 +13,7 @@ from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import environment_spec, make_batch
-from oodil.pipeline.evaluation import distance_of
+from oodil.pipeline.evaluation import DISTANCE_EPISODES, distance_of
 from oodil.pipeline.results import Assignment, Imitator, ScoreHistory, TrainedImitators
 from oodil.pipeline.seeding import derive_key, torch_seed
 from oodil.pipeline.stage import Cost, JobContext, Run, Stage, register
@@ -75,7 +75,7 @@ class ImitatorsStage(Stage):
     """A job per cluster and training, each with its own checkpoint and artifact; empty clusters have none."""
 
     name = "imitators"
-    version = 3
+    version = 4
     inputs = ("demonstrations", "clustering")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
@@ -106,7 +106,8 @@ class ImitatorsStage(Stage):
         seen = train(learner, config.environment, gail, [probe], context, checkpoints, starts=starts)
         history = ScoreHistory(cluster.members.astype(np.int64), seen.steps("logits"), seen.values("logits"))
         policy = learner.behavior_policy()
-        distance = distance_of(policy, reward, config.environment, cluster.seed, starts)
+        key = derive_key(cluster.seed, "distance")
+        distance = distance_of(policy, reward, config.environment, DISTANCE_EPISODES, key, starts)
         trained = Imitator(policy, reward.discriminator_arrays(), distance)
         return trained.files() | history.files()
 

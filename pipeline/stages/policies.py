@@ -9,7 +9,7 @@ from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import GailConfig, RunConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import environment_spec
-from oodil.pipeline.evaluation import distance_of, evaluate
+from oodil.pipeline.evaluation import DISTANCE_EPISODES, distance_of, evaluate
 from oodil.pipeline.results import LearningCurve, Policy, Training, Trainings, discriminator_file, value_file
 from oodil.pipeline.seeding import derive_key, torch_seed
 from oodil.pipeline.stage import Cost, JobContext, Run, Stage, register, stage_named
@@ -27,7 +27,7 @@ class PolicyStage(Stage):
     A competing method is an instance with a weighting of its own, registered beside it.
     """
 
-    version = 4
+    version = 5
     distributed = True
 
     def __init__(self, name: str, title: str, weighting: str | None) -> None:
@@ -55,7 +55,8 @@ class PolicyStage(Stage):
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return what a training depends on."""
         gail = self.gail(config).model_dump(mode="json")
-        return {"gail": gail, "environment": config.environment.settings()}
+        candidates = config.imitation.num_candidates
+        return {"gail": gail, "num_candidates": candidates, "environment": config.environment.settings()}
 
     def gail(self, config: RunConfig) -> GailConfig:
         """Return how each training is done."""
@@ -91,8 +92,9 @@ class PolicyStage(Stage):
         return weighting.load(run).weights
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
-        """Train the policy and evaluate it with its mean action."""
+        """Train the policy, go back to where its mean action came closest, and evaluate it."""
         from oodil.pipeline.algorithms.gail import imitator
+        from oodil.pipeline.candidates import Candidates
         from oodil.pipeline.training import Probe, train
 
         config, evaluation = run.config, run.config.evaluation
@@ -111,8 +113,10 @@ class PolicyStage(Stage):
             return np.array([seen.mean_return, seen.std_return, seen.mean_length])
 
         known = [curve_point()] if self.begin(run, learner) and evaluation.num_points else []
-        probe = Probe("curve", evaluation.num_points, curve_point)
-        history = train(learner, environment, gail, [probe], context, self.checkpoints(run, job))
+        candidates = Candidates(learner, environment, config.imitation.num_candidates)
+        probes = [Probe("curve", evaluation.num_points, curve_point), candidates.probe]
+        history = train(learner, environment, gail, probes, context, self.checkpoints(run, job))
+        kept_after = candidates.keep_closest(history)
         policy = Policy(
             gaussian=learner.behavior_policy(),
             environment_id=environment.id,
@@ -127,8 +131,9 @@ class PolicyStage(Stage):
         curve = LearningCurve(steps, mean, std, length, evaluation.episodes)
         key = derive_key(config.seed, "final")
         final = evaluate(policy.gaussian, environment.id, environment.dynamics, evaluation.final_episodes, key)
-        distance = distance_of(policy.gaussian, learner.reward_model, environment, seed)
-        training = Training(job, policy.env_steps, distance, final.mean_return)
+        key = derive_key(seed, "distance")
+        distance = distance_of(policy.gaussian, learner.reward_model, environment, DISTANCE_EPISODES, key)
+        training = Training(job, policy.env_steps, kept_after, distance, final.mean_return)
         discriminator = discriminator_file(learner.reward_model.discriminator_arrays())
         value = value_file(learner.value_arrays())
         return policy.files() | value | discriminator | curve.files() | final.files() | Trainings((training,)).files()

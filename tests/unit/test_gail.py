@@ -11,7 +11,7 @@ from oodil.pipeline.algorithms.discriminator import imitation_reward
 from oodil.pipeline.algorithms.gail import AdversarialReward, imitator
 from oodil.pipeline.algorithms.learner import Learner
 from oodil.pipeline.config import DiscriminatorConfig, GailConfig
-from oodil.pipeline.data import TransitionBatch
+from oodil.pipeline.data import Episode, TransitionBatch
 from oodil.pipeline.errors import DataError
 
 
@@ -192,6 +192,24 @@ def test_step_scale_multiplies_the_step_size(demonstrations, rollout):
 
     assert moved(1.0) == pytest.approx(1e-2, rel=1e-2)
     assert moved(0.25) == pytest.approx(0.25e-2, rel=1e-2)
+
+
+def test_a_failed_episode_stays_where_it_failed_until_the_time_limit(demonstrations):
+    shown = demonstrations(101, 101)
+    reward = AdversarialReward(shown, np.ones(2), DiscriminatorConfig(), max_episode_steps=100, root_seed=0)
+    path = shown.observations[:101]
+    whole, short = Episode(path), path[:31]
+    held = Episode(np.concatenate([short, np.repeat(short[-1:], 70, axis=0)]))
+    failed = reward.distance([whole, Episode(short, terminated=True)])
+    assert failed == reward.distance([whole, held])
+    assert failed > reward.distance([whole, Episode(short)]), "a recording that ends says nothing of what follows"
+
+
+def test_an_episode_that_ends_where_demonstrations_do_has_not_failed(demonstrations):
+    shown = demonstrations(201, 201)
+    reward = AdversarialReward(shown, np.ones(2), DiscriminatorConfig(), max_episode_steps=1000, root_seed=0)
+    distances = [reward.distance([Episode(shown.observations[:201], terminated=ends)]) for ends in (False, True)]
+    assert distances[0] == distances[1]
 
 
 def test_an_imitator_is_a_learner_with_an_adversarial_reward(demonstrations, rollout, assert_same_bits):

@@ -47,6 +47,7 @@ def test_a_preset_sets_the_whole_run_and_its_clustering(name: str) -> None:
         assert (gail.discriminator.steps_per_iteration, gail.final_std, gail.anneal) == (1, None, False)
     assert (config.transferability.reading.discriminator, config.transferability.kept_from) == ("last", 0)
     assert (config.transferability.num_trainings, config.imitation.num_trainings) == (1, 1)
+    assert config.imitation.num_candidates == 1
     steps = config.imitation.gail.steps_per_iteration
     assert -(-steps // config.imitation.gail.value.minibatch_size) == 30
 

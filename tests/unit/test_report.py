@@ -203,9 +203,11 @@ def test_verdicts_and_other_weights_are_on_the_page(full: tuple[Run, Page]) -> N
 def test_the_trainings_of_a_policy_begin_with_the_one_that_was_kept(full: tuple[Run, Page]) -> None:
     policies = contents(full[0]).policies
     assert policies is not None
-    assert [(row.policy, row.name, row.kept, row.distance) for row in policies.trainings[:2]] == [
-        ("ours", "training 2", True, "0.200"),
-        ("ours", "training 1", False, "0.300"),
+    steps = policies.rows[0].env_steps
+    assert steps is not None
+    assert [(row.policy, row.name, row.kept, row.kept_after, row.distance) for row in policies.trainings[:2]] == [
+        ("ours", "training 2", True, steps, "0.200"),
+        ("ours", "training 1", False, steps * 3 // 4, "0.300"),
     ]
     assert policies.trainings[1].mean_return == pytest.approx(2 * 2951.4)
     assert "The trainings of each policy" in full[1].text

@@ -11,7 +11,7 @@ from oodil.pipeline.algorithms.learner import EnvReward, Learner
 from oodil.pipeline.artifacts import Checkpoints
 from oodil.pipeline.collecting import InlineRollouts
 from oodil.pipeline.config import EnvironmentConfig, GailConfig, PpoConfig, TrainingConfig, TrpoConfig, ValueConfig
-from oodil.pipeline.training import experience, train
+from oodil.pipeline.training import Probe, experience, train
 
 
 class Context:
@@ -60,6 +60,13 @@ def test_episodes_begin_where_they_are_to(tmp_path: Path) -> None:
     assert len(seen) == 4 and all(each is start for each in seen)
     batch = experience(learner.behavior_policy(), EnvironmentConfig(), config, 25, 0, Context(), starts=start)
     assert (batch.observations[0] == start[0]).all()
+
+
+@pytest.mark.parametrize(("count", "expected"), [(1, [9]), (2, [7, 9]), (5, [5, 6, 7, 8, 9]), (8, [5, 6, 7, 8, 9])])
+def test_probes_of_the_second_half_end_with_the_training(count: int, expected: list[int]) -> None:
+    probe = Probe("any", count, lambda: np.zeros(1), second_half=True)
+    assert [iteration for iteration in range(10) if probe.is_due(iteration, 10)] == expected
+    assert probe.is_due(0, 1)
 
 
 ALWAYS = {"reward", "policy_lag", "kl", "entropy", "value_loss", "return", "length"}

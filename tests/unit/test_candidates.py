@@ -1,0 +1,31 @@
+"""Which point of a training is kept, and that it is what remains."""
+
+import numpy as np
+import pytest
+import torch
+
+from oodil.pipeline.algorithms.gail import imitator
+from oodil.pipeline.candidates import Candidates
+from oodil.pipeline.config import EnvironmentConfig, GailConfig
+from oodil.pipeline.training import History
+
+
+@pytest.mark.parametrize("closest", [0, 1, 2])
+def test_the_closest_candidate_is_what_remains_of_a_training(demonstrations, assert_same_bits, closest: int) -> None:
+    learner = imitator(12, 3, 1000, demonstrations(30, observation_dim=12), np.ones(1), GailConfig(total_steps=1), 0)
+    candidates, history, states, distances = Candidates(learner, EnvironmentConfig(), 3), History(), [], []
+    for n in range(3):
+        for network in (learner.policy, learner.value, learner.reward_model.discriminator):
+            with torch.no_grad():
+                for parameter in network.parameters():
+                    parameter.mul_(1.1)
+        measured = candidates.probe.measure()
+        distances.append(measured[0])
+        measured[0] = abs(n - closest)
+        history.append(candidates.probe.name, 100 * (n + 1), measured)
+        arrays = learner.behavior_policy().arrays() | learner.value_arrays()
+        states.append(arrays | {k: v.copy() for k, v in learner.reward_model.discriminator_arrays().items()})
+    assert len(set(distances)) == 3, "the policies are not told apart"
+    assert candidates.keep_closest(history) == 100 * (closest + 1)
+    kept = learner.behavior_policy().arrays() | learner.value_arrays() | learner.reward_model.discriminator_arrays()
+    assert_same_bits(kept, states[closest])
