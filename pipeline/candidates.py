@@ -1,7 +1,7 @@
-"""What a training gives: of some points in its second half, the policy that came closest to the demonstrations.
+"""What a training gives: of some points in its second half, the last that is as close to the demonstrations as any.
 
-Adversarial training does not come to rest. A policy that walks at one point falls at another, and the end is no better
-than the points before it. The distance to the demonstrations, which needs no reward, tells them apart.
+Adversarial training does not come to rest. A policy that walks at one point falls at another, and the end is as likely
+as any to be one of those. The distance to the demonstrations, which needs no reward, tells them apart.
 
 Letters: M candidates, P parameters of all networks.
 """
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 EPISODES = 8
 """Mean-action episodes of each candidate, from the same starts for all."""
+AS_CLOSE = 1.1
+"""Times the smallest distance: so far apart lie measurements of one policy. Among equals the last has learned most."""
 NAME = "candidates"
 
 
@@ -38,12 +40,13 @@ class Candidates:
         self.probe = Probe(NAME, count, self._measure, second_half=True)
 
     def keep_closest(self, history: History) -> int:
-        """Set the networks back to the closest candidate; return the environment steps after which it was one."""
+        """Set the networks back to the last of the closest; return the environment steps after which they were so."""
         candidates = history.values(NAME)
-        closest = int(candidates[:, 0].argmin())
-        parameters = torch.from_numpy(candidates[closest, 1:].astype(np.float32))
+        distances = candidates[:, 0]
+        kept = np.flatnonzero(distances <= AS_CLOSE * distances.min())[-1]
+        parameters = torch.from_numpy(candidates[kept, 1:].astype(np.float32))
         vector_to_parameters(parameters, self._networks.parameters())
-        return int(history.steps(NAME)[closest])
+        return int(history.steps(NAME)[kept])
 
     def _measure(self) -> NDArray[np.float64]:
         """Return (1 + P,) the distance of the networks as they are, and their parameters."""

@@ -115,7 +115,7 @@ class ImitationConfig(Section):
     is kept. They run side by side where there are no more workers than trainings."""
     num_candidates: PositiveInt = 8
     """Points in the second half of a training at which its mean actions are compared with the weighted demonstrations;
-    the closest is what the training gives. The last of them is the end; with 1 it is the only one, as in the paper."""
+    the last of the closest is what the training gives. With 1 it is the end, as in the paper."""
 
 
 class FinetuningConfig(Section):

@@ -10,8 +10,10 @@ from oodil.pipeline.config import EnvironmentConfig, GailConfig
 from oodil.pipeline.training import History
 
 
-@pytest.mark.parametrize("closest", [0, 1, 2])
-def test_the_closest_candidate_is_what_remains_of_a_training(demonstrations, assert_same_bits, closest: int) -> None:
+@pytest.mark.parametrize(
+    ("told", "kept"), [((1, 2, 3), 0), ((3, 1, 2), 1), ((3, 2, 1), 2), ((1, 1.09, 1.11), 1), ((1.05, 1, 1.05), 2)]
+)
+def test_the_last_of_the_closest_is_what_remains_of_a_training(demonstrations, assert_same_bits, told, kept) -> None:
     learner = imitator(12, 3, 1000, demonstrations(30, observation_dim=12), np.ones(1), GailConfig(total_steps=1), 0)
     candidates, history, states, distances = Candidates(learner, EnvironmentConfig(), 3), History(), [], []
     for n in range(3):
@@ -21,11 +23,13 @@ def test_the_closest_candidate_is_what_remains_of_a_training(demonstrations, ass
                     parameter.mul_(1.1)
         measured = candidates.probe.measure()
         distances.append(measured[0])
-        measured[0] = abs(n - closest)
+        measured[0] = told[n]
         history.append(candidates.probe.name, 100 * (n + 1), measured)
         arrays = learner.behavior_policy().arrays() | learner.value_arrays()
         states.append(arrays | {k: v.copy() for k, v in learner.reward_model.discriminator_arrays().items()})
     assert len(set(distances)) == 3, "the policies are not told apart"
-    assert candidates.keep_closest(history) == 100 * (closest + 1)
-    kept = learner.behavior_policy().arrays() | learner.value_arrays() | learner.reward_model.discriminator_arrays()
-    assert_same_bits(kept, states[closest])
+    assert candidates.keep_closest(history) == 100 * (kept + 1)
+    remaining = (
+        learner.behavior_policy().arrays() | learner.value_arrays() | learner.reward_model.discriminator_arrays()
+    )
+    assert_same_bits(remaining, states[kept])
