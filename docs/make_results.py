@@ -28,7 +28,9 @@ NAIVE = "naive_gail"
 HEAD = """# Results
 
 This page is written by `python docs/make_results.py` from the files of
-`benchmarks/results/`. Returns are of the last policy's mean actions. With five seeds
+`benchmarks/results/`. Returns are of mean actions of the policy that is kept; in tables made before
+29 November 2026, of which "How it was made" has the times, that is the end of a training, and the distance
+that chooses among trainings [hardly saw falls](measurements.md#distances-and-returns). With five seeds
 or more there is the interquartile mean (IQM) with its 95 % interval; fewer are listed and have none."""
 
 

@@ -27,8 +27,10 @@ def alone() -> str:
         reached = [seed["steps_to_target"] or float("inf") for seed in seeds]
         steps = ", ".join("never" if each == float("inf") else f"{each / 1000:,.0f} k" for each in reached)
         returns = [seed["final_return"] for seed in seeds]
+        # Made before a training had candidates.
+        end = "" if "kept_after" in seeds[0] else "; the end"
         rows.append((
-            f"{task}, {_dynamics(seeds[0]['demonstrator'])} → {_dynamics(seeds[0]['imitator'])}",
+            f"{task}, {_dynamics(seeds[0]['demonstrator'])} → {_dynamics(seeds[0]['imitator'])}{end}",
             f"{seeds[0]['seed']} to {seeds[-1]['seed']}",
             f"{seeds[0]['target']:,.0f}",
             f"{'never' if median(reached) == float('inf') else f'{median(reached) / 1000:,.0f} k'} ({steps})",
@@ -39,8 +41,9 @@ def alone() -> str:
     head = ("environment", "seeds", "target", "steps to it: median", "training", "final return: mean", "episodes above")
     return f"""## One source alone
 
-GAIL with the one setting, on demonstrations of one source that the imitator can reproduce; the last column is the
-share of 100 final episodes of each seed that are above the target. {_made(file, measured)}
+GAIL with the one setting, on demonstrations of one source that the imitator can reproduce: what a run would keep of
+one training, or its end where that is said. The last column is the share of 100 episodes of each seed that are above
+the target. {_made(file, measured)}
 
 {lines(head, rows, escape=False)}"""
 

@@ -116,6 +116,9 @@ class ImitationConfig(Section):
     num_candidates: PositiveInt = 8
     """Points in the second half of a training at which its mean actions are compared with the weighted demonstrations;
     the last of the closest is what the training gives. With 1 it is the end, as in the paper."""
+    warm_start: bool = True
+    """Whether our policy goes on from the imitator of the cluster that it learns most from, with a standard deviation
+    of `least_std`, instead of beginning anew as baselines do, and as in the paper."""
 
 
 class FinetuningConfig(Section):

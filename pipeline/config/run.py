@@ -72,7 +72,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     name: {
         "clustering": {"preset": name},
         "transferability": {"gail": _PAPER_GAIL, "reading": {"discriminator": "last"}, "kept_from": 0.0},
-        "imitation": {"gail": _PAPER_GAIL, "num_trainings": 1, "num_candidates": 1},
+        "imitation": {"gail": _PAPER_GAIL, "num_trainings": 1, "num_candidates": 1, "warm_start": False},
     }
     for name in CLUSTERING_PRESETS
 }

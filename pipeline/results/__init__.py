@@ -6,15 +6,13 @@
 from oodil.pipeline.results.clusters import Assignment, ClusterDiagnostics, cluster_model_files, load_cluster_model
 from oodil.pipeline.results.demonstrations import CollectedDemonstrations
 from oodil.pipeline.results.following import FeasibilityScale, Following, Reproducibility, Tracker
-from oodil.pipeline.results.networks import discriminator_file, load_discriminator
+from oodil.pipeline.results.networks import discriminator_file, load_discriminator, load_value, value_file
 from oodil.pipeline.results.policies import (
     Evaluation,
     LearningCurve,
     Policy,
     Training,
     Trainings,
-    load_value,
-    value_file,
 )
 from oodil.pipeline.results.scores import Imitator, Reading, ScoreHistory, TrainedImitators, Transferability
 

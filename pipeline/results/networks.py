@@ -11,6 +11,7 @@ from oodil.pipeline.policy import GaussianPolicy
 
 _POLICY = "policy.safetensors"
 _DISCRIMINATOR = "discriminator.safetensors"
+_VALUE = "value.safetensors"
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -36,6 +37,16 @@ def discriminator_file(arrays: Arrays) -> Files:
 def load_discriminator(artifact: Artifact) -> Arrays:
     """Return a discriminator's parameters by name."""
     return artifact.arrays(_DISCRIMINATOR)
+
+
+def value_file(arrays: Arrays) -> Files:
+    """Return the file of a policy's value function, with which its training can be continued."""
+    return {_VALUE: encode_arrays(arrays)}
+
+
+def load_value(artifact: Artifact) -> Arrays:
+    """Return a value function's parameters by name."""
+    return artifact.arrays(_VALUE)
 
 
 def fields_of(artifact: Artifact, name: str, kind: type) -> Arrays:

@@ -9,13 +9,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from oodil.pipeline.artifacts import Artifact, Files, encode_arrays, encode_json
+from oodil.pipeline.artifacts import Artifact, Files, encode_json
 from oodil.pipeline.errors import DataError
 from oodil.pipeline.policy import GaussianPolicy, action_units
-from oodil.pipeline.results.networks import Arrays, load_policy, policy_file
+from oodil.pipeline.results.networks import load_policy, policy_file
 
 _POLICY_META = "policy.json"
-_VALUE = "value.safetensors"
 _CURVE = "curve.json"
 _EVALUATION = "evaluation.json"
 _TRAININGS = "trainings.json"
@@ -190,16 +189,6 @@ class Policy:
             env_steps=described["env_steps"],
             acts_in_integers=described.get("acts_in_integers", False),
         )
-
-
-def value_file(arrays: Arrays) -> Files:
-    """Return the file of a policy's value function, with which its training can be continued."""
-    return {_VALUE: encode_arrays(arrays)}
-
-
-def load_value(artifact: Artifact) -> Arrays:
-    """Return a value function's parameters by name."""
-    return artifact.arrays(_VALUE)
 
 
 def _bounds(values: Any, unbounded: float) -> NDArray[np.float32]:

@@ -17,7 +17,9 @@ from oodil.pipeline.results.networks import (
     fields_of,
     load_discriminator,
     load_policy,
+    load_value,
     policy_file,
+    value_file,
 )
 
 _SCORES = "transferability.safetensors"
@@ -54,9 +56,11 @@ class ScoreHistory:
 
 @dataclass(frozen=True)
 class Imitator:
-    """A policy and the discriminator that it was trained against."""
+    """A policy, its value function and the discriminator that it was trained against."""
 
     policy: GaussianPolicy
+    value: Arrays
+    """Its parameters by name."""
     discriminator: Arrays
     """Its parameters by name."""
     distance: float
@@ -65,12 +69,14 @@ class Imitator:
     def files(self) -> Files:
         """Return the artifact's content."""
         described = {_DISTANCE: encode_json({"distance": self.distance})}
-        return {**policy_file(self.policy)} | discriminator_file(self.discriminator) | described
+        networks = policy_file(self.policy) | value_file(self.value) | discriminator_file(self.discriminator)
+        return networks | described
 
     @classmethod
     def load(cls, artifact: Artifact) -> Self:
         """Read an artifact."""
-        return cls(load_policy(artifact), load_discriminator(artifact), artifact.json(_DISTANCE)["distance"])
+        networks = load_policy(artifact), load_value(artifact), load_discriminator(artifact)
+        return cls(*networks, artifact.json(_DISTANCE)["distance"])
 
 
 @dataclass(frozen=True)

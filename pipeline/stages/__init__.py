@@ -15,6 +15,7 @@ from oodil.pipeline.stages import (
     experts,
     feasibility,
     finetuning,
+    imitation,
     imitators,
     inverse_dynamics,
     marks,
@@ -34,6 +35,7 @@ __all__ = [
     "experts",
     "feasibility",
     "finetuning",
+    "imitation",
     "imitators",
     "inverse_dynamics",
     "marks",
@@ -71,7 +73,7 @@ def stages(config: RunConfig) -> list[Stage]:
                 raise ConfigError(f"baselines: {entry!r} cannot be loaded: {error}") from error
         known = [stage.name for stage in registered() if isinstance(stage, PolicyStage) and stage.name != "finetuning"]
         if name not in known:
-            raise ConfigError(f"baselines: no policy {name!r}; there are {', '.join(known)}")
+            raise ConfigError(f"baselines: no policy {name!r}; there are {', '.join(sorted(known))}")
         add(name)
     return list(found.values())
 

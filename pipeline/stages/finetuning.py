@@ -17,7 +17,7 @@ from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.results import Policy, Transferability, load_value
 from oodil.pipeline.stage import JobContext, Run, base_run, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
-from oodil.pipeline.stages.policies import PolicyStage
+from oodil.pipeline.stages.policies import PolicyStage, refuse_other_widths
 from oodil.pipeline.stages.weighting import Weighting
 
 if TYPE_CHECKING:
@@ -85,13 +85,7 @@ class FinetuningStage(PolicyStage):
             raise ConfigError(
                 f"finetuning.initial_std is {std:g}; it must reach imitation.gail.final_std {gail.final_std:g}"
             )
-        before = _base(config).config.imitation.gail
-        for name, old, new in (
-            ("policy_hidden", before.policy_hidden, gail.policy_hidden),
-            ("value.hidden", before.value.hidden, gail.value.hidden),
-        ):
-            if old != new:
-                raise ConfigError(f"imitation.gail.{name} is {list(new)}; the policy that is continued has {list(old)}")
+        refuse_other_widths("the policy that is continued", _base(config).config.imitation.gail, gail)
 
     def gail(self, config: RunConfig) -> GailConfig:
         """Return how each training is done: as the policy's was, for a part of its steps and with less noise."""

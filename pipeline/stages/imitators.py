@@ -108,7 +108,7 @@ class ImitatorsStage(Stage):
         policy = learner.behavior_policy()
         key = derive_key(cluster.seed, "distance")
         distance = distance_of(policy, reward, config.environment, DISTANCE_EPISODES, key, starts)
-        trained = Imitator(policy, reward.discriminator_arrays(), distance)
+        trained = Imitator(policy, learner.value_arrays(), reward.discriminator_arrays(), distance)
         return trained.files() | history.files()
 
     def combine(self, run: Run) -> Files:

@@ -1,4 +1,4 @@
-"""Stage 5: a policy, by GAIL on weighted demonstrations (Eqn 7 and 8); policies differ in their weightings alone."""
+"""Stage 5: a policy, by GAIL on weighted demonstrations (Eqn 7 and 8); policies differ in their weightings."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +9,7 @@ from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import GailConfig, RunConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import environment_spec
+from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.evaluation import DISTANCE_EPISODES, distance_of, evaluate
 from oodil.pipeline.results import LearningCurve, Policy, Training, Trainings, discriminator_file, value_file
 from oodil.pipeline.seeding import derive_key, torch_seed
@@ -156,7 +157,16 @@ class AllStepsPolicy(PolicyStage):
         return gail.model_copy(update={"total_steps": gail.total_steps + share})
 
 
-register(PolicyStage("imitation", title="ours", weighting="transferability"))
+def refuse_other_widths(name: str, before: GailConfig, gail: GailConfig) -> None:
+    """Raise ConfigError unless ``imitation.gail`` has networks as wide as those that it goes on with, of ``name``."""
+    for key, old, new in (
+        ("policy_hidden", before.policy_hidden, gail.policy_hidden),
+        ("value.hidden", before.value.hidden, gail.value.hidden),
+    ):
+        if old != new:
+            raise ConfigError(f"imitation.gail.{key} is {list(new)}; {name} has {list(old)}")
+
+
 register(PolicyStage("naive_gail", title="naive GAIL", weighting=None))
 register(PolicyStage("oracle", title="oracle", weighting="marks"))
 register(AllStepsPolicy("naive_gail_all_steps", title="naive GAIL, our steps in all", weighting=None))

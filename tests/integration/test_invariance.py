@@ -10,8 +10,10 @@ import pytest
 import oodil
 from oodil.pipeline.algorithms.weights import share_lasted, transferability_of_divergences
 from oodil.pipeline.environments.locomotion import HopperEnv
+from oodil.pipeline.evaluation import evaluate
 from oodil.pipeline.loading import load_config
 from oodil.pipeline.results import Imitator, Reading, Trainings
+from oodil.pipeline.seeding import derive_key
 from oodil.workers.channels import endpoint_folder
 from tests.runs import MICRO, LiveRun, artifacts, has_checkpoint, nothing_left, run, wait_for
 
@@ -175,3 +177,23 @@ def test_trainings_run_side_by_side_and_after_a_kill_give_the_same_bits(
     assert "resumed from checkpoint" in begun
     assert not list((run_dir / "logs").glob("*rollout-worker*"))
     assert artifacts(run_dir) == artifacts(inline_twice[0])
+
+
+def test_our_policy_goes_on_from_the_imitator_of_what_it_draws_most_and_others_begin_anew(
+    inline: Path, tmp_path: Path
+) -> None:
+    results = oodil.open_run(inline)
+    found = results.transferability
+    lengths = results.demonstrations.lengths - 1
+    drawn = {cluster: (found.weights * lengths)[found.clusters == cluster].sum() for cluster in found.read_from}
+    cluster = max(drawn, key=lambda each: drawn[each])
+    begun = Imitator.load(results.run.job_artifact("imitators", found.read_from[cluster]))
+    config = results.config
+    environment, key = config.environment, derive_key(config.seed, "curve")
+    seen = evaluate(begun.policy, environment.id, environment.dynamics, config.evaluation.episodes, key)
+    curves = {name: results.curve(name) for name in POLICIES}
+    assert (curves["imitation"].env_steps[0], curves["imitation"].mean_return[0]) == (0, seen.mean_return)
+    assert len(curves["imitation"].env_steps) == len(curves["naive_gail"].env_steps) + 1
+    shutil.copytree(inline, tmp_path / "run")
+    anew = [NAIVE, "imitation.warm_start=false"]
+    assert oodil.run(MICRO, anew, workers=0, run_dir=tmp_path / "run", force=["imitation"]).curve().env_steps[0] > 0

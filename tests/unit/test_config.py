@@ -76,6 +76,7 @@ def test_overrides_reach_every_depth_and_are_typed(write):
     overrides = [
         "seed=7",
         "imitation.gail.policy_hidden=[32, 16]",
+        "imitation.warm_start=false",
         "imitation.gail.policy_optimizer.kind=ppo",
         "imitation.gail.policy_optimizer.learning_rate=1e-3",
         "transferability.gail.policy_optimizer.max_kl=0.02",
@@ -87,7 +88,7 @@ def test_overrides_reach_every_depth_and_are_typed(write):
         "name=a-b",
     ]
     config = load_config(write(values()), overrides)
-    assert config.seed == 7
+    assert config.seed == 7 and config.imitation.warm_start is False
     assert config.imitation.gail.policy_hidden == (32, 16)
     assert config.imitation.gail.policy_optimizer == PpoConfig(learning_rate=1e-3)
     assert config.transferability.gail.policy_optimizer == TrpoConfig(max_kl=0.02)
@@ -199,9 +200,16 @@ def test_a_value_of_any_type_is_taken_or_refused(key):
             {"demonstrations": {"sources": [SOURCE], "transferable": ["a"]}},
             "labels, transferable and unmarked are for a file",
         ),
+        (
+            {"imitation": {"gail": {"total_steps": 1, "policy_hidden": [32]}}},
+            r"imitation.gail.policy_hidden is \[32\]; transferability.gail, .*warm_start is false, has \[64, 64\]",
+        ),
         ({"baselines": ["oracle_target"]}, "learns from an expert of the imitator's own dynamics; name one"),
         ({"baselines": ["oracle"]}, "the oracle needs sources that are marked transferable"),
-        ({"baselines": ["bc"]}, "config: baselines: no policy 'bc'; there are imitation, naive_gail, oracle"),
+        (
+            {"baselines": ["bc"]},
+            "config: baselines: no policy 'bc'; there are exact_id, f_mdp, f_mdp_per_source, id_gail",
+        ),
         ({"runtime": {"workers": -1}}, "runtime.workers: .*greater than or equal to 0, got -1"),
     ],
 )

@@ -1,0 +1,58 @@
+"""Stage 5, of the method: its policy goes on from the imitator of what it learns most from."""
+
+from math import log
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from oodil.pipeline.config import GailConfig, RunConfig
+from oodil.pipeline.results import Imitator, Transferability
+from oodil.pipeline.stage import Run, register
+from oodil.pipeline.stages.imitators import ImitatorsStage
+from oodil.pipeline.stages.policies import PolicyStage, refuse_other_widths
+from oodil.pipeline.stages.transferability import TransferabilityStage
+
+if TYPE_CHECKING:
+    from oodil.pipeline.algorithms.gail import AdversarialReward
+    from oodil.pipeline.algorithms.learner import Learner
+
+
+class ImitationStage(PolicyStage):
+    """Weighted GAIL that begins where the job of a cluster ended: what was learned there is not learned twice."""
+
+    def __init__(self) -> None:
+        super().__init__("imitation", title="ours", weighting=TransferabilityStage.name)
+        self.inputs = (*self.inputs, ImitatorsStage.name)
+
+    @property
+    def module(self) -> str:
+        """This module."""
+        return type(self).__module__
+
+    def check(self, config: RunConfig) -> None:
+        """Refuse networks of other widths than those that are continued."""
+        if config.imitation.warm_start:
+            name = "transferability.gail, which it goes on from unless imitation.warm_start is false,"
+            refuse_other_widths(name, config.transferability.gail, config.imitation.gail)
+
+    def job_settings(self, config: RunConfig) -> dict[str, Any]:
+        """Return what a training depends on, where it begins included."""
+        return super().job_settings(config) | {"warm_start": config.imitation.warm_start}
+
+    def gail(self, config: RunConfig) -> GailConfig:
+        """Return how each training is done: with less noise at first, if it is no beginner's."""
+        gail = config.imitation.gail
+        return gail.model_copy(update={"initial_log_std": log(gail.least_std)}) if config.imitation.warm_start else gail
+
+    def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> bool:
+        """Take over policy and value function of the cluster of which most transitions are drawn."""
+        if not run.config.imitation.warm_start:
+            return False
+        found = Transferability.load(run.artifact(TransferabilityStage.name))
+        drawn = np.bincount(found.clusters, found.weights * (self.demonstrations(run).lengths - 1))
+        imitator = Imitator.load(run.job_artifact(ImitatorsStage.name, found.read_from[int(drawn.argmax())]))
+        learner.continue_from(imitator.policy, imitator.value)
+        return True
+
+
+register(ImitationStage())
