@@ -133,7 +133,7 @@ def test_seeds(experiment):
             {"methods": ["imitation", "imitation"]},
             "experiment.yaml: two methods have the same name: imitation",
         ),
-        ({"methods": ["gail"]}, "row '1:2': .*baselines: no policy 'gail'; there are imitation"),
+        ({"methods": ["gail"]}, "row '1:2': .*baselines: no policy 'gail'; there are exact_id"),
         ({"published": {"3:3": {}}}, "published: no row '3:3'; there are 1:2, 2:1"),
         ({"published": {"1:2": {"bc": 1}}}, "published: 1:2: no method 'bc'; there are imitation, naive_gail, kept"),
         ({"row_seeds": {"3:3": 1}}, "row_seeds: no row '3:3'"),
