@@ -85,7 +85,7 @@ def test_frozen_models_say_of_the_runs_own_demonstrations_what_the_run_said(run_
 def test_what_is_not_known_is_named(run_dir: Path, tmp_path: Path) -> None:
     with pytest.raises(oodil.OodilError, match=r"'tests\.toi:far' cannot be loaded: No module named 'tests\.toi'"):
         oodil.load_config(MICRO, ["baselines=['tests.toi:far']"])
-    with pytest.raises(oodil.OodilError, match="no policy 'transferability'; there are imitation"):
+    with pytest.raises(oodil.OodilError, match=r"no policy 'transferability'; there are exact_id, .*, imitation"):
         oodil.load_config(MICRO, ["baselines=[transferability]"])
     with pytest.raises(oodil.OodilError, match="no stage 'naive_gail'; this run has"):
         oodil.open_run(run_dir).policy("naive_gail")
