@@ -44,13 +44,17 @@ class Candidates:
         candidates = history.values(NAME)
         distances = candidates[:, 0]
         kept = np.flatnonzero(distances <= AS_CLOSE * distances.min())[-1]
-        parameters = torch.from_numpy(candidates[kept, 1:].astype(np.float32))
+        parameters = torch.from_numpy(candidates[kept, 2:].astype(np.float32))
         vector_to_parameters(parameters, self._networks.parameters())
         return int(history.steps(NAME)[kept])
 
+    def env_steps(self, history: History) -> int:
+        """Return the environment steps that telling them apart took."""
+        return int(history.values(NAME)[:, 1].sum())
+
     def _measure(self) -> NDArray[np.float64]:
-        """Return (1 + P,) the distance of the networks as they are, and their parameters."""
+        """Return (2 + P,) the distance of the networks as they are, the steps that it took, and their parameters."""
         learner = self._learner
         key = derive_key(learner.root_seed, NAME)
-        distance = distance_of(learner.behavior_policy(), learner.reward_model, self._environment, EPISODES, key)
-        return np.append(distance, parameters_to_vector(self._networks.parameters()).detach().numpy())
+        measured = distance_of(learner.behavior_policy(), learner.reward_model, self._environment, EPISODES, key)
+        return np.append(measured, parameters_to_vector(self._networks.parameters()).detach().numpy())

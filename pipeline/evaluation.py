@@ -74,7 +74,8 @@ def distance_of(
     episodes: int,
     key: Key,
     starts: NDArray[np.float32] | None = None,
-) -> float:
-    """Return how far fresh episodes of mean actions are from the demonstrations that a reward model was made for."""
+) -> tuple[float, int]:
+    """Return how far fresh episodes of mean actions are from a reward model's demonstrations, and their steps."""
     simulators = make_batch(environment.id, environment.dynamics, episodes)
-    return reward.distance(run_episodes(simulators, policy, numpy_rng(key), stochastic=False, starts=starts))
+    seen = run_episodes(simulators, policy, numpy_rng(key), stochastic=False, starts=starts)
+    return reward.distance(seen), sum(len(episode.states) - 1 for episode in seen)

@@ -26,6 +26,7 @@ class Training:
 
     job: str
     env_steps: int
+    """Of the training, and of the episodes by which its candidates and its end were measured."""
     kept_after: int
     """Environment steps after which its policy was what is kept of it."""
     distance: float

@@ -27,7 +27,7 @@ _HISTORY = "history.safetensors"
 _SUMMARY = "summary.json"
 _IMITATORS = "imitators.json"
 _JOB_SCORES = "scores.safetensors"
-_DISTANCE = "distance.json"
+_IMITATOR = "imitator.json"
 _DIVERGENCES = "divergences.safetensors"
 _READING = "reading.json"
 _READERS = "readers.safetensors"
@@ -65,10 +65,12 @@ class Imitator:
     """Its parameters by name."""
     distance: float
     """Of mean-action episodes to the demonstrations, see `AdversarialReward.distance`."""
+    env_steps: int
+    """Of its training and of those episodes."""
 
     def files(self) -> Files:
         """Return the artifact's content."""
-        described = {_DISTANCE: encode_json({"distance": self.distance})}
+        described = {_IMITATOR: encode_json({"distance": self.distance, "env_steps": self.env_steps})}
         networks = policy_file(self.policy) | value_file(self.value) | discriminator_file(self.discriminator)
         return networks | described
 
@@ -76,7 +78,7 @@ class Imitator:
     def load(cls, artifact: Artifact) -> Self:
         """Read an artifact."""
         networks = load_policy(artifact), load_value(artifact), load_discriminator(artifact)
-        return cls(*networks, artifact.json(_DISTANCE)["distance"])
+        return cls(*networks, **artifact.json(_IMITATOR))
 
 
 @dataclass(frozen=True)

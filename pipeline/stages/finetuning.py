@@ -72,7 +72,7 @@ class LaterScoresStage(Weighting):
 class FinetuningStage(PolicyStage):
     """Goes on from the final policy and its value function, with noise set anew and a fresh discriminator."""
 
-    version = 2
+    version = 3
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return what a training depends on, the policy it begins with included."""

@@ -75,7 +75,7 @@ class ImitatorsStage(Stage):
     """A job per cluster and training, each with its own checkpoint and artifact; empty clusters have none."""
 
     name = "imitators"
-    version = 4
+    version = 5
     inputs = ("demonstrations", "clustering")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:
@@ -107,17 +107,17 @@ class ImitatorsStage(Stage):
         history = ScoreHistory(cluster.members.astype(np.int64), seen.steps("logits"), seen.values("logits"))
         policy = learner.behavior_policy()
         key = derive_key(cluster.seed, "distance")
-        distance = distance_of(policy, reward, config.environment, DISTANCE_EPISODES, key, starts)
-        trained = Imitator(policy, learner.value_arrays(), reward.discriminator_arrays(), distance)
+        distance, measured = distance_of(policy, reward, config.environment, DISTANCE_EPISODES, key, starts)
+        env_steps = gail.num_iterations * gail.steps_per_iteration + measured
+        trained = Imitator(policy, learner.value_arrays(), reward.discriminator_arrays(), distance, env_steps)
         return trained.files() | history.files()
 
     def combine(self, run: Run) -> Files:
         """List the trained imitators, and add up what they took."""
-        gail = run.config.transferability.gail
-        jobs = self.jobs(run)
+        artifacts = {job: run.job_artifact(self.name, job) for job in self.jobs(run)}
         return TrainedImitators(
-            env_steps=len(jobs) * gail.num_iterations * gail.steps_per_iteration,
-            sha256={job: run.job_artifact(self.name, job).sha256 for job in jobs},
+            env_steps=sum(Imitator.load(artifact).env_steps for artifact in artifacts.values()),
+            sha256={job: artifact.sha256 for job, artifact in artifacts.items()},
         ).files()
 
     def env_steps(self, run: Run) -> int:

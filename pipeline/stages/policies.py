@@ -28,7 +28,7 @@ class PolicyStage(Stage):
     A competing method is an instance with a weighting of its own, registered beside it.
     """
 
-    version = 5
+    version = 6
     distributed = True
 
     def __init__(self, name: str, title: str, weighting: str | None) -> None:
@@ -133,8 +133,9 @@ class PolicyStage(Stage):
         key = derive_key(config.seed, "final")
         final = evaluate(policy.gaussian, environment.id, environment.dynamics, evaluation.final_episodes, key)
         key = derive_key(seed, "distance")
-        distance = distance_of(policy.gaussian, learner.reward_model, environment, DISTANCE_EPISODES, key)
-        training = Training(job, policy.env_steps, kept_after, distance, final.mean_return)
+        distance, measured = distance_of(policy.gaussian, learner.reward_model, environment, DISTANCE_EPISODES, key)
+        env_steps = policy.env_steps + candidates.env_steps(history) + measured
+        training = Training(job, env_steps, kept_after, distance, final.mean_return)
         discriminator = discriminator_file(learner.reward_model.discriminator_arrays())
         value = value_file(learner.value_arrays())
         return policy.files() | value | discriminator | curve.files() | final.files() | Trainings((training,)).files()
