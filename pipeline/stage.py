@@ -78,7 +78,7 @@ class Cost:
     """What a stage is expected to cost; what is not known before its inputs are is left out."""
 
     env_steps: int = 0
-    """As `Stage.env_steps` will count them."""
+    """Of trainings; those of the episodes by which they are measured come on top."""
     core_s: float = 0.0
     """Seconds of one core, of all jobs together."""
     jobs: int = 1
