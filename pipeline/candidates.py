@@ -15,7 +15,7 @@ from torch.nn import ModuleList
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from oodil.pipeline.config import EnvironmentConfig
-from oodil.pipeline.evaluation import distance_of
+from oodil.pipeline.evaluation import CANDIDATE_EPISODES, distance_of
 from oodil.pipeline.seeding import derive_key
 from oodil.pipeline.training import History, Probe
 
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from oodil.pipeline.algorithms.gail import AdversarialReward
     from oodil.pipeline.algorithms.learner import Learner
 
-EPISODES = 8
-"""Mean-action episodes of each candidate, from the same starts for all."""
 AS_CLOSE = 1.1
 """Times the smallest distance: so far apart lie measurements of one policy. Among equals the last has learned most."""
 NAME = "candidates"
@@ -54,7 +52,7 @@ class Candidates:
 
     def _measure(self) -> NDArray[np.float64]:
         """Return (2 + P,) the distance of the networks as they are, the steps that it took, and their parameters."""
-        learner = self._learner
+        learner, episodes = self._learner, CANDIDATE_EPISODES
         key = derive_key(learner.root_seed, NAME)
-        measured = distance_of(learner.behavior_policy(), learner.reward_model, self._environment, EPISODES, key)
+        measured = distance_of(learner.behavior_policy(), learner.reward_model, self._environment, episodes, key)
         return np.append(measured, parameters_to_vector(self._networks.parameters()).detach().numpy())

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 DISTANCE_EPISODES = 16
 """Mean-action episodes that the distance of a finished policy to demonstrations is measured with."""
+CANDIDATE_EPISODES = 8
+"""Those for each candidate of a training, from the same starts for all."""
 
 
 def run_episodes(

@@ -69,24 +69,31 @@ def _finished(artifact: Artifact | None, name: str) -> Artifact:
 
 
 LEARNING_S = 25e-6
-"""Seconds of one core that learning takes for each environment step, measurements along the way included; by hand, on a
-machine that does 15,000 steps of Hopper in a second."""
+"""Seconds of one core of the reference machine that learning takes for each environment step."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a stage is expected to cost; what is not known before its inputs are is left out."""
+    """What all jobs of a stage are expected to cost; what is not known before its inputs are is left out.
+
+    How long steps and episodes take is the machine's affair. Seconds are those of one core of the reference machine,
+    which takes 15,000 steps of Hopper in a second.
+    """
 
     env_steps: int = 0
-    """Of trainings; those of the episodes by which they are measured come on top."""
-    core_s: float = 0.0
-    """Seconds of one core, of all jobs together."""
+    """Of trainings."""
+    episodes: int = 0
+    """By which trainings are measured, and whose steps count among the run's."""
+    other_episodes: int = 0
+    """Whose steps do not: those of demonstrators, and of evaluations on the true return."""
+    compute_s: float = 0.0
+    """Seconds beside all steps."""
     jobs: int = 1
 
     @classmethod
-    def of_training(cls, env_steps: int, step_s: float, jobs: int = 1) -> "Cost":
+    def of_training(cls, env_steps: int, jobs: int = 1) -> "Cost":
         """Return the cost of trainings that take so many environment steps together."""
-        return cls(env_steps, env_steps * (step_s + LEARNING_S), jobs)
+        return cls(env_steps, compute_s=env_steps * LEARNING_S, jobs=jobs)
 
 
 class Stage(ABC):
@@ -143,8 +150,8 @@ class Stage(ABC):
         """Return the environment steps that its finished artifact took; 0 for a stage without a simulator."""
         return 0
 
-    def cost(self, config: RunConfig, step_s: float) -> Cost:
-        """Return what it is expected to cost where a core takes ``step_s`` seconds for an environment step."""
+    def cost(self, config: RunConfig) -> Cost:
+        """Return what it is expected to cost."""
         return Cost()
 
     def origin(self, run: Run) -> dict[str, Any]:

@@ -35,13 +35,13 @@ class ClusteringStage(Stage):
         """Return the whole section."""
         return config.clustering.model_dump(mode="json")
 
-    def cost(self, config: RunConfig, step_s: float) -> Cost:
+    def cost(self, config: RunConfig) -> Cost:
         """Return the cost of all iterations, the warm-up included."""
         section = config.clustering
         if section.features == "states" or section.num_clusters == 1:
             return Cost()
         iterations = section.warmup_iterations + section.joint_iterations
-        return Cost(core_s=iterations * ITERATION_S * section.batch_size / 128)
+        return Cost(compute_s=iterations * ITERATION_S * section.batch_size / 128)
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Train the encoder and the centers, or find those of the states, and label every demonstration.

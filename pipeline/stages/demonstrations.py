@@ -98,14 +98,13 @@ class DemonstrationsStage(CopyStage):
         """Return the settings without the imitator's dynamics, in which `combine` alone runs experts."""
         return {name: value for name, value in self.settings(config).items() if name != "imitator"}
 
-    def cost(self, config: RunConfig, step_s: float) -> Cost:
+    def cost(self, config: RunConfig) -> Cost:
         """Return the cost of whole episodes of every source, of which none has to be thrown away."""
         sources = config.demonstrations.sources
         if not sources:
             return Cost()
         rounds = sum(-(-source.count // COLLECTION_SIMULATORS) for source in sources)
-        limit = environment_spec(config.environment.id, config.environment.dynamics).max_episode_steps
-        return Cost(core_s=rounds * COLLECTION_SIMULATORS * limit * step_s, jobs=len(sources))
+        return Cost(other_episodes=rounds * COLLECTION_SIMULATORS, jobs=len(sources))
 
     def jobs(self, run: Run) -> list[str]:
         """Return one job per source, or the stage itself for a file."""

@@ -76,10 +76,10 @@ class ExpertsStage(Stage):
         training = EXPERT_TRAINING.model_dump(mode="json")
         return {"environment": config.environment.id, "sources": sources, "training": training}
 
-    def cost(self, config: RunConfig, step_s: float) -> Cost:
+    def cost(self, config: RunConfig) -> Cost:
         """Return the cost of all trainings."""
         jobs = TRAININGS * sum(source.expert_folder is not None for source in config.demonstrations.sources)
-        return Cost.of_training(jobs * EXPERT_TRAINING.total_steps, step_s, max(jobs, 1))
+        return Cost.of_training(jobs * EXPERT_TRAINING.total_steps, max(jobs, 1))
 
     def jobs(self, run: Run) -> list[str]:
         """Return a job per source and seed; hand-written experts have none."""

@@ -53,9 +53,9 @@ class FeasibilityWeighting(Weighting):
             "environment": environment,
         }
 
-    def cost(self, config: RunConfig, step_s: float) -> Cost:
+    def cost(self, config: RunConfig) -> Cost:
         """Return the cost of the one policy."""
-        return Cost.of_training(config.cluster_steps, step_s)
+        return Cost.of_training(config.cluster_steps)
 
     def jobs(self, run: Run) -> list[str]:
         """Return the one policy."""
@@ -118,9 +118,9 @@ class PerSourceFeasibility(FeasibilityWeighting):
     name = "feasibility_per_source"
     title = "f-MDP, one policy per source"
 
-    def cost(self, config: RunConfig, step_s: float) -> Cost:
+    def cost(self, config: RunConfig) -> Cost:
         """Return the cost of all policies; how many sources a file has is not known before it is read."""
-        return Cost.of_training(config.cluster_steps, step_s, len(config.demonstrations.sources) or 1)
+        return Cost.of_training(config.cluster_steps, len(config.demonstrations.sources) or 1)
 
     def jobs(self, run: Run) -> list[str]:
         """Return one job per source that has demonstrations, named by its number."""

@@ -3,7 +3,7 @@
 The true reward plays no part. What the discriminators say of the demonstrations is the next stage's affair.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -124,10 +124,11 @@ class ImitatorsStage(Stage):
         """Return the environment steps of all imitators together."""
         return TrainedImitators.load(run.artifact(self.name)).env_steps
 
-    def cost(self, config: RunConfig, step_s: float) -> Cost:
+    def cost(self, config: RunConfig) -> Cost:
         """Return the cost of all imitators if no cluster is empty."""
         gail, jobs = config.transferability.gail, config.clustering.num_clusters * config.transferability.num_trainings
-        return Cost.of_training(jobs * gail.num_iterations * gail.steps_per_iteration, step_s, jobs)
+        cost = Cost.of_training(jobs * gail.num_iterations * gail.steps_per_iteration, jobs)
+        return replace(cost, episodes=jobs * DISTANCE_EPISODES)
 
 
 def cluster_of(job: str) -> int:

@@ -69,11 +69,10 @@ class InverseDynamics(Weighting):
         """Return the imitator's environment, and how it is explored and learned from."""
         return config.inverse_dynamics.model_dump() | {"environment": config.environment.settings()}
 
-    def cost(self, config: RunConfig, step_s: float) -> Cost:
+    def cost(self, config: RunConfig) -> Cost:
         """Return the cost of exploration; what the model and the demonstrations take comes on top."""
         how = _exploration(config)
-        env_steps = how.num_iterations * how.steps_per_iteration
-        return Cost(env_steps, env_steps * step_s)
+        return Cost(how.num_iterations * how.steps_per_iteration)
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Explore, learn the model, follow what was held out and every demonstration, and turn errors into scores."""

@@ -1,5 +1,6 @@
 """Stage 5: a policy, by GAIL on weighted demonstrations (Eqn 7 and 8); policies differ in their weightings."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from oodil.pipeline.config import GailConfig, RunConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import environment_spec
 from oodil.pipeline.errors import ConfigError
-from oodil.pipeline.evaluation import DISTANCE_EPISODES, distance_of, evaluate
+from oodil.pipeline.evaluation import CANDIDATE_EPISODES, DISTANCE_EPISODES, distance_of, evaluate
 from oodil.pipeline.results import LearningCurve, Policy, Training, Trainings, discriminator_file, value_file
 from oodil.pipeline.seeding import derive_key, torch_seed
 from oodil.pipeline.stage import Cost, JobContext, Run, Stage, register, stage_named
@@ -79,10 +80,15 @@ class PolicyStage(Stage):
         """Return what it learns from."""
         return load_demonstrations(run)
 
-    def cost(self, config: RunConfig, step_s: float) -> Cost:
-        """Return the cost of all trainings."""
-        gail, jobs = self.gail(config), config.imitation.num_trainings
-        return Cost.of_training(jobs * gail.num_iterations * gail.steps_per_iteration, step_s, jobs)
+    def cost(self, config: RunConfig) -> Cost:
+        """Return the cost of all trainings, and of the episodes by which they are measured."""
+        gail, jobs, evaluation = self.gail(config), config.imitation.num_trainings, config.evaluation
+        cost = Cost.of_training(jobs * gail.num_iterations * gail.steps_per_iteration, jobs)
+        return replace(
+            cost,
+            episodes=jobs * (config.imitation.num_candidates * CANDIDATE_EPISODES + DISTANCE_EPISODES),
+            other_episodes=jobs * (evaluation.num_points * evaluation.episodes + evaluation.final_episodes),
+        )
 
     def weights(self, run: Run) -> NDArray[np.float64]:
         """Return (N,) weights of the demonstrations."""

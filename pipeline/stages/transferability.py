@@ -76,14 +76,14 @@ class TransferabilityStage(Weighting):
         """Return one job per imitator, under its name."""
         return ImitatorsStage().jobs(run)
 
-    def cost(self, config: RunConfig, step_s: float) -> Cost:
+    def cost(self, config: RunConfig) -> Cost:
         """Return the cost of all readings if no cluster is empty."""
         section = config.transferability
         if section.reading.discriminator == "last":
             return Cost()
         jobs, reading = config.clustering.num_clusters * section.num_trainings, section.reading
         job_s = reading.steps * reading.repetitions * READING_STEP_S * reading.batch_size / 512
-        return Cost(core_s=jobs * job_s, jobs=jobs)
+        return Cost(episodes=jobs * READ_EPISODES, compute_s=jobs * job_s, jobs=jobs)
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Read the demonstrations of a cluster against fresh episodes of its imitator, or by its own discriminator."""

@@ -10,8 +10,8 @@ from oodil.bench import usable_cores
 from oodil.experiments import Table
 from oodil.orchestrator import read_run
 from oodil.pipeline.artifacts import fingerprint
-from oodil.pipeline.config import EnvironmentConfig
-from oodil.pipeline.environments import make_batch
+from oodil.pipeline.config import RunConfig
+from oodil.pipeline.environments import Simulators, make_batch
 from oodil.pipeline.errors import UnusableEnvironmentError
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.stage import Run, Stage, state_of
@@ -20,6 +20,9 @@ MEASURED_S = 0.3
 """Seconds for which the environment is stepped."""
 START_S = 2.0
 """Seconds that a stage takes to load what it computes with, and to write what it has found."""
+REFERENCE_STEPS_PER_S = 15_000
+"""Of Hopper on one core of the machine that the constants of `oodil.pipeline.stage.Cost` and the documents' times are
+from."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,24 @@ class StageCost:
     jobs: int
     shares: Mapping[str, float] = field(default_factory=dict)
     """By job, its share of the seconds; empty where jobs are alike."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast one core of this machine is."""
+
+    step_s: float
+    """Seconds for a step of the environment."""
+    max_episode_steps: int
+    slowness: float
+    """Times that it takes for what the reference machine computes in one second."""
+
+    def cost(self, stage: Stage, config: RunConfig) -> StageCost:
+        """Return what all jobs of a stage are expected to cost on one core, without its start."""
+        cost = stage.cost(config)
+        env_steps = cost.env_steps + cost.episodes * self.max_episode_steps
+        all_steps = env_steps + cost.other_episodes * self.max_episode_steps
+        return StageCost(env_steps, all_steps * self.step_s + cost.compute_s * self.slowness, cost.jobs)
 
 
 @dataclass(frozen=True)
@@ -54,20 +75,19 @@ class RunCost:
 
 def run_cost(run: Run, chosen: Sequence[Stage], workers: int | None, force: Collection[str] = ()) -> RunCost:
     """Return what the chosen stages of a run will cost; ``workers`` is None for an engine that alone knows it."""
-    config = run.config
-    step_s = step_seconds(config.environment, config.imitation.gail.simulators_per_group)
+    config, pace = run.config, pace_of(run.config)
     costs: dict[str, StageCost] = {}
     for stage in chosen:
         computed = any(costs[name].seconds for name in stage.inputs if name in costs) or stage.name in force
         if not computed and state_of(stage, run).state == "done":
             costs[stage.name] = StageCost(0, 0.0, 1)
             continue
-        cost = stage.cost(config, step_s)
+        cost = pace.cost(stage, config)
         cores = min(max(workers or 1, 1), usable_cores())
         if stage.distributed and cost.jobs < cores:
-            seconds = cost.core_s / cores
+            seconds = cost.seconds / cores
         else:
-            seconds = cost.core_s / cost.jobs * -(-cost.jobs // cores)
+            seconds = cost.seconds / cost.jobs * -(-cost.jobs // cores)
         costs[stage.name] = StageCost(cost.env_steps, START_S + seconds, cost.jobs)
     return RunCost(costs, workers)
 
@@ -93,7 +113,7 @@ def outlook(table: Table, selected: dict[str, list[Stage]]) -> list[Outlook]:
     found = [(RunResults(table.opened(run)), run.parts) for run in table.runs]
     found += [(RunResults(read_run(table.folder.parent / path)), parts) for path, parts in table.beside.items()]
     done = {part for results, parts in found for stage, part in parts.items() if results.is_done(stage)}
-    rates: dict[str, float] = {}
+    paces: dict[str, Pace] = {}
     taken: set[str] = set()
     outlooks = []
     for name, stages in selected.items():
@@ -104,10 +124,10 @@ def outlook(table: Table, selected: dict[str, list[Stage]]) -> list[Outlook]:
             kinds["finished" if part in done else "shared" if part in taken else "own"].append(stage)
             taken.add(part)
         environment = fingerprint([config.environment.id, config.environment.settings()])
-        if environment not in rates:
-            rates[environment] = step_seconds(config.environment, config.imitation.gail.simulators_per_group)
-        costs = [stage.cost(config, rates[environment]) for stage in kinds["own"]]
-        seconds = sum(START_S + cost.core_s for cost in costs)
+        if environment not in paces:
+            paces[environment] = pace_of(config)
+        costs = [paces[environment].cost(stage, config) for stage in kinds["own"]]
+        seconds = sum(START_S + cost.seconds for cost in costs)
         cost = StageCost(sum(cost.env_steps for cost in costs), seconds, 1)
         names = {kind: [stage.name for stage in those] for kind, those in kinds.items()}
         outlooks.append(Outlook(name, cost, **names))
@@ -124,19 +144,28 @@ def table_cost(found: Sequence[Outlook], workers: int | None) -> RunCost:
     return RunCost({"table": StageCost(steps, together, len(found), shares)}, workers)
 
 
-def step_seconds(environment: EnvironmentConfig, count: int = 8) -> float:
-    """Return how long a step of an environment takes on one core, by so many simulators under random actions.
+def pace_of(config: RunConfig) -> Pace:
+    """Return how fast this machine is with the imitator's environment.
 
     Raises UnusableEnvironmentError for one that does not do what it should.
     """
+    environment, count = config.environment, config.imitation.gail.simulators_per_group
+    simulators = make_batch(environment.id, environment.dynamics, count)
     try:
-        return _measured(environment, count)
+        step_s = step_seconds(simulators)
     except (RuntimeError, FloatingPointError) as error:
         raise UnusableEnvironmentError(str(error)) from error
+    return Pace(step_s, simulators.max_episode_steps, REFERENCE_STEPS_PER_S * hopper_seconds())
 
 
-def _measured(environment: EnvironmentConfig, count: int) -> float:
-    simulators = make_batch(environment.id, environment.dynamics, count)
+def hopper_seconds() -> float:
+    """Return how long a step of Hopper takes on one core."""
+    return step_seconds(make_batch("oodil/Hopper-v0", {}, 8))
+
+
+def step_seconds(simulators: Simulators) -> float:
+    """Return how long a step of one of these simulators takes under random actions."""
+    count = simulators.num_simulators
     rng = np.random.default_rng(0)
     for index in range(count):
         simulators.reset(index, seed=index)

@@ -82,7 +82,7 @@ class Table:
                     raise ConfigError(f"{self.experiment.name}: no {kind} {name!r}; there are {', '.join(known[kind])}")
         found = {run.name: run.stages(methods or known["method"]) for run in self.runs if not rows or run.row in rows}
         configs = {run.name: run.config for run in self.runs}
-        by_length = sorted(found, key=lambda name: -sum(each.cost(configs[name], 0.0).core_s for each in found[name]))
+        by_length = sorted(found, key=lambda name: -sum(each.cost(configs[name]).compute_s for each in found[name]))
         return {name: found[name] for name in by_length if found[name]}
 
     def unfinished(self, selected: dict[str, list[Stage]]) -> dict[str, list[Stage]]:

@@ -139,7 +139,7 @@ class _Shown(Observer):
         self._context = context
         results = RunResults(run)
         self._steps = {
-            stage.name: 0 if results.is_done(stage.name) else max(stage.cost(run.config, 0.0).env_steps, LEAST_STEPS)
+            stage.name: 0 if results.is_done(stage.name) else max(stage.cost(run.config).env_steps, LEAST_STEPS)
             for stage in stages
         }
         self._total = max(1, sum(self._steps.values()))

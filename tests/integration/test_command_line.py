@@ -214,7 +214,7 @@ def test_the_doctor_goes_on_when_something_is_broken(monkeypatch: pytest.MonkeyP
     def broken(*_: object) -> float:
         raise RuntimeError("no simulator here\nand a second line")
 
-    monkeypatch.setattr("oodil.estimate.step_seconds", broken)
+    monkeypatch.setattr("oodil.estimate.hopper_seconds", broken)
     output = CliRunner().invoke(app, ["doctor"]).output
     assert "attention  rate         RuntimeError: no simulator here\n" in output
     assert "disk" in output and "rendering" in output

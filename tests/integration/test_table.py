@@ -132,7 +132,7 @@ def test_progress_is_that_of_what_is_left(tmp_path: Path) -> None:
         left = [
             stage for stage in selected["only-seed0"] if methods or stage.name not in ("demonstrations", "naive_gail")
         ]
-        expected = sum(max(stage.cost(table.runs[0].config, 0).env_steps, LEAST_STEPS) for stage in left)
+        expected = sum(max(stage.cost(table.runs[0].config).env_steps, LEAST_STEPS) for stage in left)
         table.compute(selected, LocalEngine(0), events.append, lambda: False)
         told = [event.report for event in events if isinstance(event.report, Progress)]
         assert {each.total for each in told} == {expected} and told[-1].done == expected

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from oodil.pipeline.algorithms.gail import imitator
-from oodil.pipeline.candidates import EPISODES, NAME, Candidates
+from oodil.pipeline.candidates import NAME, Candidates
 from oodil.pipeline.config import EnvironmentConfig, GailConfig
-from oodil.pipeline.evaluation import evaluate
+from oodil.pipeline.evaluation import CANDIDATE_EPISODES, evaluate
 from oodil.pipeline.seeding import derive_key
 from oodil.pipeline.training import History
 
@@ -27,7 +27,7 @@ def test_the_last_of_the_closest_is_what_remains_of_a_training(demonstrations, a
                     parameter.mul_(1.1)
         measured = candidates.probe.measure()
         key = derive_key(learner.root_seed, NAME)
-        seen = evaluate(learner.behavior_policy(), environment.id, environment.dynamics, EPISODES, key)
+        seen = evaluate(learner.behavior_policy(), environment.id, environment.dynamics, CANDIDATE_EPISODES, key)
         env_steps += int(seen.lengths.sum())
         distances.append(measured[0])
         measured[0] = told[n]

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from oodil import estimate
-from oodil.estimate import RunCost, StageCost, run_cost
+from oodil.estimate import Pace, RunCost, StageCost, run_cost
 from oodil.orchestrator import choose
 from oodil.pipeline.artifacts import RunDirectory
 from oodil.pipeline.loading import load_config
@@ -108,20 +108,25 @@ def test_words() -> None:
 
 
 def test_what_a_run_costs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estimate, "step_seconds", lambda *_: 1e-3)
+    monkeypatch.setattr(estimate, "pace_of", lambda _: Pace(step_s=1e-3, max_episode_steps=1000, slowness=2.0))
     monkeypatch.setattr(estimate, "usable_cores", lambda: 4)
     config = load_config(MICRO, ["clustering.num_clusters=5", "imitation.num_trainings=1"])
     run = Run(config, RunDirectory(tmp_path))
     found: dict[str, Any] = run_cost(run, choose(config), workers=2).stages
     gail = config.transferability.gail
     steps = gail.num_iterations * gail.steps_per_iteration
-    assert found["imitators"].env_steps == 5 * steps
+    # Each is measured by 16 episodes.
+    assert found["imitators"].env_steps == 5 * (steps + 16_000)
     # Five jobs on two workers: three rounds.
-    assert found["imitators"].seconds == pytest.approx(estimate.START_S + 3 * steps * (1e-3 + LEARNING_S))
+    seconds = (steps + 16_000) * 1e-3 + steps * 2 * LEARNING_S
+    assert found["imitators"].seconds == pytest.approx(estimate.START_S + 3 * seconds)
     gail = config.imitation.gail
     steps = gail.num_iterations * gail.steps_per_iteration
-    # One learner, whose workers share the work.
-    assert found["imitation"].seconds == pytest.approx(estimate.START_S + steps * (1e-3 + LEARNING_S) / 2)
+    # Eight candidates by 8 episodes each, the policy by 16.
+    assert found["imitation"].env_steps == steps + 80_000
+    # One learner, whose workers share the work. Its curve is of two points by 2 episodes each, its end of 2 more.
+    seconds = (steps + 86_000) * 1e-3 + steps * 2 * LEARNING_S
+    assert found["imitation"].seconds == pytest.approx(estimate.START_S + seconds / 2)
     # 3 and 4 demonstrations of 1000 steps, sixteen at a time.
     assert found["demonstrations"].seconds == pytest.approx(estimate.START_S + 16.0)
     assert found["demonstrations"].env_steps == 0

@@ -15,8 +15,6 @@ import typer
 
 PYTHONS = (3, 11), (3, 13)
 """The oldest and the newest version that is tested."""
-REFERENCE_STEPS_PER_S = 15_000
-"""Of Hopper on one core, on the machine whose times are in the documents."""
 FREE_GB = 2.0
 """What a long run and its report may take."""
 EXTRAS = {
@@ -101,10 +99,9 @@ def _threads() -> Iterator[Finding]:
 
 
 def _rate() -> Iterator[Finding]:
-    from oodil.estimate import step_seconds
-    from oodil.pipeline.config import EnvironmentConfig
+    from oodil.estimate import REFERENCE_STEPS_PER_S, hopper_seconds
 
-    rate = 1 / step_seconds(EnvironmentConfig(id="oodil/Hopper-v0"))
+    rate = 1 / hopper_seconds()
     found = f"{rate:,.0f} steps/s of Hopper on one core ({REFERENCE_STEPS_PER_S:,} where the documents' times are from)"
     slow = f"runs take {REFERENCE_STEPS_PER_S / rate:.0f} times as long as in the documents"
     yield Finding("simulator", found, slow if rate < REFERENCE_STEPS_PER_S / 2 else "")
