@@ -18,10 +18,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from oodil.pipeline.artifacts import Artifact, RunDirectory, read_artifact, remove_artifact, write_artifact, write_file
+from oodil.pipeline.artifacts import RunDirectory, finished, remove_artifact, write_artifact, write_file
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.environments import check_environment
-from oodil.pipeline.errors import ConfigError, DamagedArtifactError, StorageError, UnfinishedError
+from oodil.pipeline.errors import ConfigError, StorageError, UnfinishedError
 from oodil.pipeline.loading import parse_config
 from oodil.pipeline.locks import held
 from oodil.pipeline.metrics import check_logger
@@ -30,6 +30,9 @@ from oodil.pipeline.stages import stages
 from oodil.pipeline.versions import library_versions
 from oodil.workers.engine import Engine, Outcome
 from oodil.workers.reports import Event
+
+LOCK = ".lock"
+"""Held in a run's folder by the process that works on the run."""
 
 
 class Observer:
@@ -51,34 +54,47 @@ class Observer:
 def open_run(path: Path, config: RunConfig, force: Collection[str] = ()) -> Run:
     """Create a run's folder, or accept one of the same run, and write the resolved configuration into it.
 
-    Raises ConfigError, and leaves the folder as it is, when it holds something else, or a finished stage of other
-    settings that is not to be replaced (``force`` names those that are; what follows from them is replaced, too).
+    Raises ConfigError, and leaves the folder as it is, when it holds something else, a finished stage of other settings
+    that is not to be replaced (``force`` names those that are; what follows from them is replaced, too), or a run that
+    another process works on, whose jobs would read the new configuration.
     """
     directory = RunDirectory(path)
-    run = Run(config, directory)
-    if directory.config.exists():
-        earlier = read_run(path).config
-        for field in ("name", "seed", "environment"):
-            old, new = getattr(earlier, field), getattr(config, field)
-            if old != new:
-                raise ConfigError(
-                    f"{path}: holds a run with {field} {_short(old)}, not {_short(new)}; choose another --run-dir"
-                )
-        refuse_to_replace(run, force)
-    elif path.exists() and any(path.iterdir()):
+    if not directory.config.exists():
+        _make_folder(directory, config.demonstrations.file)
+    with _lock(directory):
+        run = Run(config, directory)
+        if directory.config.exists():
+            _refuse_another_run(path, config)
+            refuse_to_replace(run, force)
+        write_file(directory.config, (config.model_dump_json(indent=2) + "\n").encode())
+    return run
+
+
+def _make_folder(directory: RunDirectory, file: Path | None) -> None:
+    """Make the folder of a new run, on a disk that has room for a copy of its demonstrations."""
+    path = directory.path
+    if path.exists() and {child.name for child in path.iterdir()} - {LOCK}:
         raise ConfigError(f"{path}: is not empty and not a run; choose another --run-dir")
     try:
         path.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(path).free
     except OSError as error:
         raise StorageError(f"{path}: {error.strerror or error}") from error
-    file = config.demonstrations.file
-    if file is not None and not directory.config.exists() and free < file.stat().st_size:
+    if file is not None and free < file.stat().st_size:
         raise StorageError(
             f"{path}: {free / 2**20:.1f} MiB are free, and a copy of {file} alone has {file.stat().st_size / 2**20:.1f}"
         )
-    write_file(directory.config, (config.model_dump_json(indent=2) + "\n").encode())
-    return run
+
+
+def _refuse_another_run(path: Path, config: RunConfig) -> None:
+    """Raise ConfigError if the folder holds a run that this configuration is not one of."""
+    earlier = read_run(path).config
+    for field in ("name", "seed", "environment"):
+        old, new = getattr(earlier, field), getattr(config, field)
+        if old != new:
+            raise ConfigError(
+                f"{path}: holds a run with {field} {_short(old)}, not {_short(new)}; choose another --run-dir"
+            )
 
 
 def read_run(path: Path) -> Run:
@@ -153,10 +169,19 @@ def execute(
     """
     observer = observer or Observer()
     with _lock(run.directory):
+        _refuse_other_configuration(run)
         _record(run.directory, "run_started", engine=str(engine), versions=library_versions())
         for stage in chosen:
             _execute_stage(stage, run, engine, observer, should_stop, force)
         _record(run.directory, "run_finished")
+
+
+def _refuse_other_configuration(run: Run) -> None:
+    """Raise ConfigError if the folder's configuration, which jobs read, has become another since the run was opened."""
+    if run.directory.config.exists():
+        written = read_run(run.directory.path).config.model_copy(update={"runtime": run.config.runtime})
+        if written.model_dump() != run.config.model_dump():
+            raise ConfigError(f"{run.directory.path}: another process has changed its configuration")
 
 
 def _execute_stage(
@@ -209,6 +234,8 @@ def _unfinished(run: Run, stage: Stage, outcome: Outcome) -> UnfinishedError:
 
 def _pending(stage: Stage, run: Run, forced: bool) -> list[str]:
     """Return the jobs whose artifacts are not current, and clear away what is in their place."""
+    if forced:  # First of all: without its jobs it is not finished any more, wherever this ends.
+        remove_artifact(run.directory.stage(stage.name))
     pending = []
     for job in stage.jobs(run):
         path = run.directory.job(stage.name, job)
@@ -220,22 +247,10 @@ def _pending(stage: Stage, run: Run, forced: bool) -> list[str]:
     return pending
 
 
-def finished(path: Path, origin: dict[str, Any]) -> Artifact | None:
-    """Return the artifact at ``path`` if it is of this origin and undamaged."""
-    try:
-        artifact = read_artifact(path)
-        if artifact is None or not artifact.made_from(origin):
-            return None
-        artifact.verify()
-    except DamagedArtifactError:
-        return None
-    return artifact
-
-
 @contextmanager
 def _lock(directory: RunDirectory) -> Iterator[None]:
     """Hold the run for this process."""
-    with held(directory.path / ".lock") as is_held:
+    with held(directory.path / LOCK) as is_held:
         if not is_held:
             raise ConfigError(f"{directory.path}: another process is working on this run")
         yield

@@ -234,6 +234,18 @@ def read_artifact(path: Path) -> Artifact | None:
         raise DamagedArtifactError(f"{path / MANIFEST}: not a manifest ({error})") from error
 
 
+def finished(path: Path, origin: dict[str, Any]) -> Artifact | None:
+    """Return the artifact at ``path`` if it is of this origin and undamaged."""
+    try:
+        artifact = read_artifact(path)
+        if artifact is None or not artifact.made_from(origin):
+            return None
+        artifact.verify()
+    except DamagedArtifactError:
+        return None
+    return artifact
+
+
 def remove_artifact(path: Path) -> None:
     """Delete an artifact; its manifest goes first, so that half a deletion is no artifact. Raises StorageError."""
     try:

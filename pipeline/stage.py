@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
-from oodil.pipeline.artifacts import Artifact, Checkpoints, Files, RunDirectory, read_artifact
+from oodil.pipeline.artifacts import Artifact, Checkpoints, Files, RunDirectory, finished, read_artifact
 from oodil.pipeline.collecting import RolloutSource
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.errors import ConfigError, DamagedArtifactError, NotFinishedError
@@ -106,6 +106,8 @@ class Stage(ABC):
     """Stages whose artifacts it reads."""
     distributed: bool = False
     """Whether rollout workers collect for its job; otherwise a job collects in its own process."""
+    jobs_are_read: bool = False
+    """Whether the artifacts of its jobs are read once it is finished, so that it is no more sound than they are."""
 
     @property
     def module(self) -> str:
@@ -233,6 +235,15 @@ def state_of(stage: Stage, run: Run) -> StageState:
         artifact.verify()
     except DamagedArtifactError as error:
         return StageState("damaged", str(error))
+    if stage.jobs_are_read:
+        try:
+            jobs = stage.jobs(run)
+        except DamagedArtifactError:
+            return StageState("stale", "an input is damaged", follows_input=True)
+        for job in jobs:
+            path = run.directory.job(stage.name, job)
+            if finished(path, stage.job_origin(run, job)) is None:
+                return StageState("damaged", f"{path}: missing, damaged or made from something else")
     return StageState("done", artifact=artifact)
 
 

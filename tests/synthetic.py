@@ -79,9 +79,11 @@ class Writer:
         )
 
     def write(self, stage: str, files: Files) -> None:
-        """Write a stage's artifact, made by this code from what lies in the run."""
-        origin = stage_named(stage).origin(self.run)
-        write_artifact(self.run.directory.stage(stage), origin, files, VERSIONS)
+        """Write a stage's artifact, made by this code from what lies in the run, and empty ones of jobs that count."""
+        known = stage_named(stage)
+        for job in known.jobs(self.run) if known.jobs_are_read else ():
+            write_artifact(self.run.directory.job(stage, job), known.job_origin(self.run, job), {}, VERSIONS)
+        write_artifact(self.run.directory.stage(stage), known.origin(self.run), files, VERSIONS)
 
     def demonstrations(self) -> None:
         """About ten states each, so that the files stay small; sources differ in their returns."""

@@ -36,6 +36,7 @@ class FeasibilityWeighting(Weighting):
     name = "feasibility"
     title = "f-MDP"
     version = 1
+    jobs_are_read = True
     inputs = ("demonstrations",)
 
     def check(self, config: RunConfig) -> None:

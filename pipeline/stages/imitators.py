@@ -76,6 +76,7 @@ class ImitatorsStage(Stage):
 
     name = "imitators"
     version = 5
+    jobs_are_read = True
     inputs = ("demonstrations", "clustering")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:

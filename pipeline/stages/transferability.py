@@ -47,6 +47,7 @@ class TransferabilityStage(Weighting):
     name = "transferability"
     title = "ours"
     version = 6
+    jobs_are_read = True
     inputs = ("demonstrations", "clustering", "imitators")
 
     def settings(self, config: RunConfig) -> dict[str, Any]:

@@ -11,8 +11,8 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from oodil.orchestrator import Observer, execute, finished, read_run
-from oodil.pipeline.artifacts import Files, RunDirectory, write_artifact
+from oodil.orchestrator import Observer, execute, read_run
+from oodil.pipeline.artifacts import Files, RunDirectory, finished, write_artifact
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.errors import UnfinishedError
 from oodil.pipeline.locks import held

@@ -76,6 +76,17 @@ def test_an_observer_is_told_and_a_finished_run_is_reused(results: oodil.RunResu
     assert forced.events
 
 
+def test_a_stage_that_was_to_be_computed_again_is_not_finished_if_that_was_stopped(tmp_path: Path) -> None:
+    until = {"workers": 0, "run_dir": tmp_path, "until": "demonstrations"}
+    before = oodil.run(MICRO, **until).artifact("demonstrations")
+    with pytest.raises(oodil.UnfinishedError):
+        oodil.run(MICRO, **until, force=["demonstrations"], should_stop=lambda: True)
+    assert not oodil.open_run(tmp_path).is_done("demonstrations")
+    again = oodil.run(MICRO, **until)
+    assert again.artifact("demonstrations").sha256 == before.sha256
+    assert all((tmp_path / "jobs" / "demonstrations" / f"source-{i}" / "manifest.json").is_file() for i in (0, 1))
+
+
 def test_a_stop_is_heard_and_the_run_goes_on(results: oodil.RunResults, tmp_path: Path) -> None:
     with pytest.raises(oodil.UnfinishedError, match="oodil resume"):
         oodil.run(MICRO, ["seed=3"], workers=0, run_dir=tmp_path / "run", should_stop=lambda: True)

@@ -62,6 +62,19 @@ def test_a_damaged_artifact_is_named_and_recomputed(inline: Path) -> None:
     assert artifacts(inline) == before
 
 
+@pytest.mark.parametrize("stage", ["imitators", "transferability"])
+def test_a_stage_is_no_more_sound_than_those_of_its_jobs_that_are_read_later(inline: Path, stage: str) -> None:
+    """`oodil score` and a policy that goes on from an imitator read them."""
+    before = artifacts(inline)
+    job = sorted((inline / "jobs" / stage).iterdir())[0]
+    networks = next(job.glob("*.safetensors"))
+    networks.write_bytes(networks.read_bytes()[:-1])
+    assert oodil.open_run(inline).describe()["stages"][stage]["state"] == "damaged"
+    output = run("resume", str(inline), "--workers", "0")
+    assert f"{stage}: recomputed: {job}" in output
+    assert artifacts(inline) == before
+
+
 class NanHopper(HopperEnv):
     """Hopper whose own reward is of no use."""
 
