@@ -73,6 +73,8 @@ def open_run(path: Path, config: RunConfig, force: Collection[str] = ()) -> Run:
 def _make_folder(directory: RunDirectory, file: Path | None) -> None:
     """Make the folder of a new run, on a disk that has room for a copy of its demonstrations."""
     path = directory.path
+    if path.is_file():
+        raise ConfigError(f"{path}: is a file; choose another --run-dir")
     if path.exists() and {child.name for child in path.iterdir()} - {LOCK}:
         raise ConfigError(f"{path}: is not empty and not a run; choose another --run-dir")
     try:
@@ -145,14 +147,20 @@ def check_inputs(config: RunConfig, run: Run | None = None) -> None:
 def choose(config: RunConfig, until: str | None = None, force: Collection[str] = ()) -> list[Stage]:
     """Return the stages of a run up to one of them, or all.
 
-    Raises ConfigError, naming those there are, for a name that is none of them, be it of one to compute again.
+    Raises ConfigError, naming those there are, for a name that is none of them, be it of one to compute again, and for
+    one to compute again that comes after the last.
     """
     chosen = stages(config)
     names = [stage.name for stage in chosen]
     for name in (*force, *([] if until is None else [until])):
         if name not in names:
             raise ConfigError(f"no stage {name!r}; this run has {', '.join(names)}")
-    return chosen[: names.index(until) + 1] if until else chosen
+    if until is None:
+        return chosen
+    for name in force:
+        if names.index(name) > names.index(until):
+            raise ConfigError(f"--force {name}: comes after --until {until}, so it would not be computed")
+    return chosen[: names.index(until) + 1]
 
 
 def execute(
@@ -229,6 +237,7 @@ def _unfinished(run: Run, stage: Stage, outcome: Outcome) -> UnfinishedError:
         f"What is finished is kept; go on with:\n  oodil resume {run.directory.path}",
         stage.name,
         outcome.failed,
+        outcome.is_final,
     )
 
 

@@ -36,8 +36,10 @@ class StorageError(OodilError):
 class UnfinishedError(OodilError):
     """A stage failed or was stopped; what was finished is kept."""
 
-    def __init__(self, message: str, stage: str, failed: dict[str, str]) -> None:
+    def __init__(self, message: str, stage: str, failed: dict[str, str], is_final: bool = False) -> None:
         super().__init__(message)
         self.stage = stage
         self.failed = failed
         """The first traceback, or how it died, of each job that failed; empty after a stop."""
+        self.is_final = is_final
+        """Whether all of them failed for a reason that another attempt would meet again."""

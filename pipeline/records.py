@@ -42,7 +42,7 @@ def records(
             if results.is_done(policy):
                 cells[run.row, method, run.seed] = _cell(results, run, method, policy)
             elif run.name in failed:
-                reason = failed[run.name].strip().splitlines()[-1].replace(f"{folder.absolute()}/", "")
+                reason = _reason(failed[run.name], run, method).replace(f"{folder.absolute()}/", "")
                 failures.append({"row": run.row, "seed": run.seed, "method": method, "reason": reason})
             else:
                 missing.append([run.row, method, run.seed])
@@ -73,6 +73,12 @@ def records(
         "random_return": {row: random[key] for row, key in environment_of.items()},
         "expert_return": {row: expert[key] for row, key in environment_of.items()},
     }
+
+
+def _reason(failed: str, run: PlannedRun, method: str) -> str:
+    """Return why a method of a run failed: the last line about one of its stages, or of all if none is named."""
+    lines, stages = failed.strip().splitlines(), {stage.name for stage in run.stages([method])}
+    return next((line for line in reversed(lines) if line.partition(":")[0] in stages), lines[-1])
 
 
 def _cell(results: RunResults, run: PlannedRun, method: str, policy: str) -> dict[str, Any]:

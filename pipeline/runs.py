@@ -6,6 +6,7 @@ demonstrations never meet, on a page or in a script.
 
 import json
 from functools import cached_property
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +120,10 @@ class RunResults:
         return Transferability.load(self.artifact(name))
 
     def policy(self, name: str = "imitation") -> Policy:
-        """Return a trained policy."""
+        """Return a trained policy. Raises ConfigError for one that the run does not have."""
+        known = [each.name for each in self.policies]
+        if name not in known:
+            raise ConfigError(f"{self.path}: no policy {name!r}; this run has {', '.join(known)}")
         return Policy.load(self.artifact(name))
 
     def evaluation(self, name: str = "imitation") -> Evaluation:
@@ -217,6 +221,10 @@ class RunResults:
                 finished.add(stage)
         return {stage: seconds for stage, seconds in spent.items() if stage in finished}
 
+    def began_at(self) -> float:
+        """Return when its first command began, in seconds since 1970; infinity if there was none."""
+        return next((float(event["time"]) for event in _events(self.run) if "time" in event), inf)
+
     def seconds_ever(self) -> float:
         """Return how long all stages took, with what was interrupted and what was computed again since."""
         return sum(map(_spent, _events(self.run)))
@@ -226,7 +234,7 @@ class RunResults:
 
         ``policies`` by name: mean and std of the return, episodes, env_steps; ``weightings`` by name: see `separation`;
         ``verdicts`` by name, of weightings that train imitators: see `VerdictTable`; ``purity``; ``reproducibility``
-        with the distance of each source in ``sources``, those that count as ``reproducible`` and whether that is
+        with the name and the distance of each of ``sources``, whether it is ``reproducible``, and whether that is
         ``everything``; ``env_steps`` and ``seconds`` of all that was run. What is not known is left out.
         """
         policies, weightings, verdicts = {}, {}, {}
@@ -246,12 +254,14 @@ class RunResults:
                     verdicts[weighting.name] = self.verdicts(weighting.name).describe()
         reproducibility: dict[str, Any] = {}
         if self.is_done("reproducibility") and self.is_done("demonstrations"):
-            known = self.reproducibility
-            chosen = known.reproducible_sources(self.demonstrations)
+            known, labels = self.reproducibility, self.demonstrations.source_labels
+            distances, chosen = known.by_source(self.demonstrations), known.reproducible_sources(self.demonstrations)
             reproducibility = {
-                "sources": known.by_source(self.demonstrations),
-                "reproducible": [label for label, is_reproducible in chosen.items() if is_reproducible],
-                "everything": all(chosen.values()),
+                "sources": [
+                    {"name": label, "distance": distance, "reproducible": is_reproducible}
+                    for label, distance, is_reproducible in zip(labels, distances, chosen, strict=True)
+                ],
+                "everything": all(chosen),
             }
         found: dict[str, Any] = {
             "policies": policies,

@@ -212,6 +212,17 @@ def new_key_pair() -> KeyPair:
     return KeyPair(public, secret)
 
 
+def check_address(address: str) -> None:
+    """Raise AddressError for an address that no worker can connect to, whether or not a learner is there."""
+    context = zmq.Context()
+    try:
+        context.socket(zmq.DEALER).connect(address)
+    except zmq.ZMQError as error:
+        raise AddressError(f"cannot connect to {address!r}: {error.strerror}; expected tcp://HOST:PORT") from error
+    finally:
+        context.destroy(linger=0)
+
+
 def open_access(address: str | None, keys: Path | None) -> Access | None:
     """Return where other machines may join, or None when nothing was asked for.
 

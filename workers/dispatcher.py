@@ -87,6 +87,8 @@ class Dispatcher:
         shape = rollout.observations.shape[:2]
         if rollout.policy_version != unit.policy_version or shape != (unit.num_steps, unit.num_simulators):
             self.dropped["mismatch"] += 1
+            if given is not None:
+                self.failed(worker, name, f"a rollout of {shape} by policy {rollout.policy_version}", now)
             return
         if given is not None:
             self._durations.append(now - given)

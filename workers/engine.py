@@ -5,6 +5,7 @@ What a job computes never depends on the engine, on the number of workers, or on
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import inf
 from typing import Protocol
 
 from oodil.pipeline.config import RuntimeConfig
@@ -32,6 +33,8 @@ class Outcome:
     """Never started, or stopped before they were done."""
     stopped: bool = False
     """Whether a stop was asked for."""
+    is_final: bool = False
+    """Whether all that failed did so for a reason that another attempt would meet again."""
 
 
 class Engine(Protocol):
@@ -70,7 +73,7 @@ class Attempts:
         """Why the first one failed."""
         self._limit = limit
         self._delay_s = delay_s
-        self._furthest = 0
+        self._least_left = inf
         self._got_further = False
         self._without_progress = 0
 
@@ -79,10 +82,10 @@ class Attempts:
         self.number += 1
         return self.number
 
-    def reached(self, done: int) -> None:
-        """Note how far the current attempt is."""
-        if done > self._furthest:
-            self._furthest, self._got_further = done, True
+    def reached(self, left: int) -> None:
+        """Note how much the current attempt has left to do; what earlier ones have finished may not be part of it."""
+        if left < self._least_left:
+            self._least_left, self._got_further = left, True
 
     def failed(self, reason: str) -> float | None:
         """Note that the current attempt failed.
@@ -107,6 +110,7 @@ class JobLedger:
         self._attempts = {job: Attempts(runtime.max_attempts, runtime.restart_delay_s) for job in jobs}
         self._done: set[str] = set()
         self._failed: dict[str, str] = {}
+        self._final: set[str] = set()
         self._on_event = on_event
 
     def begin(self, job: str) -> int:
@@ -118,7 +122,7 @@ class JobLedger:
     def report(self, job: str, report: Report) -> None:
         """Note a report of the current attempt and pass it on."""
         if isinstance(report, Progress):
-            self._attempts[job].reached(report.done)
+            self._attempts[job].reached(report.total - report.done)
         self._on_event(Event(job, report))
 
     def finished(self, job: str, outcome: str) -> None:
@@ -135,6 +139,7 @@ class JobLedger:
         delay_s = attempts.failed(reason)
         if is_final:
             delay_s = None
+            self._final.add(job)
         if self.stopped:
             delay_s = None
         elif delay_s is None:
@@ -152,4 +157,5 @@ class JobLedger:
         """Return what became of the jobs, each list in the order of the jobs."""
         done = [job for job in self._attempts if job in self._done]
         not_run = [job for job in self._attempts if job not in self._done and job not in self._failed]
-        return Outcome(done, self._failed, not_run, self.stopped)
+        is_final = bool(self._failed) and self._final.issuperset(self._failed)
+        return Outcome(done, self._failed, not_run, self.stopped, is_final)

@@ -7,7 +7,8 @@ are 40 characters in ZeroMQ's Z85 encoding; secret ones are readable by their ow
 
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,12 +47,12 @@ class ClientKeys:
 
 
 def create_learner_keys(folder: Path, new_pair: Callable[[], KeyPair]) -> None:
-    """Create the learner's pair. Raises KeysError when there is one, which workers rely on."""
+    """Create the learner's pair. Raises KeysError when there is one, which workers rely on, or no place."""
     if (folder / f"{LEARNER}.secret").exists():
         raise KeysError(f"{folder}: already has a learner's keys; add a worker with --worker NAME")
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "allowed").mkdir(exist_ok=True)
-    _write_pair(folder, LEARNER, new_pair())
+    with _written():
+        (folder / "allowed").mkdir(parents=True, exist_ok=True)
+        _write_pair(folder, LEARNER, new_pair())
 
 
 def create_worker_keys(folder: Path, name: str, new_pair: Callable[[], KeyPair]) -> Path:
@@ -65,11 +66,12 @@ def create_worker_keys(folder: Path, name: str, new_pair: Callable[[], KeyPair])
     own = folder / name
     if own.exists():
         raise KeysError(f"{own}: is there already")
-    own.mkdir(mode=0o700)
-    pair = new_pair()
-    _write_pair(own, WORKER, pair)
-    (own / f"{LEARNER}.public").write_bytes(server)
-    (folder / "allowed" / f"{name}.public").write_bytes(pair.public)
+    with _written():
+        own.mkdir(mode=0o700)
+        pair = new_pair()
+        _write_pair(own, WORKER, pair)
+        (own / f"{LEARNER}.public").write_bytes(server)
+        (folder / "allowed" / f"{name}.public").write_bytes(pair.public)
     return own
 
 
@@ -84,6 +86,14 @@ def client_keys(folder: Path) -> ClientKeys:
     """Read what a worker needs, from its own folder or, beside the learner, from the learner's. Raises KeysError."""
     role = WORKER if (folder / f"{WORKER}.secret").exists() else LEARNER
     return ClientKeys(_read_pair(folder, role), _read(folder / f"{LEARNER}.public"))
+
+
+@contextmanager
+def _written() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise KeysError(f"{error.filename}: {error.strerror}") from error
 
 
 def _write_pair(folder: Path, name: str, pair: KeyPair) -> None:

@@ -8,7 +8,7 @@ that only an engine can make.
 import traceback
 from dataclasses import dataclass
 
-from oodil.pipeline.errors import UnusableEnvironmentError
+from oodil.pipeline.errors import ConfigError, DataError, ExpertError, UnfinishedError, UnusableEnvironmentError
 from oodil.workers.wire import (
     MessageError,
     Readers,
@@ -75,7 +75,7 @@ class Failed:
 
     reason: str
     is_final: bool = False
-    """Whether it should not be tried again: the environment cannot be used, and the reason is one message."""
+    """Whether it should not be tried again: it needs something that cannot be used, and the reason is one message."""
 
 
 Report = Stop | Progress | Warn | Silent | Finished | Failed
@@ -117,9 +117,13 @@ class Event:
     report: Report | Started | AttemptFailed | Replaced
 
 
+_UNUSABLE = ConfigError, DataError, ExpertError, UnusableEnvironmentError
+"""What another attempt would meet again."""
+
+
 def failure(error: BaseException) -> Failed:
     """Return the last words of what raised an error that is being handled."""
-    is_final = isinstance(error, UnusableEnvironmentError)
+    is_final = isinstance(error, _UNUSABLE) or (isinstance(error, UnfinishedError) and error.is_final)
     return Failed(shortened(str(error) if is_final else traceback.format_exc()), is_final)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from oodil.pipeline.artifacts import Files, RunDirectory
-from oodil.pipeline.config import RunConfig
+from oodil.pipeline.config import EnvironmentConfig, RunConfig
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.environments import make_batch
 from oodil.pipeline.stage import JobContext, Run, Stage, register
@@ -20,6 +20,7 @@ from oodil.workers.reports import AttemptFailed, Event, Progress
 
 WARM_UP = 0.3
 """Share of a learner's run that is not counted: processes start, and untrained robots fall all the time."""
+TIME_FORMAT = "%Y-%m-%dT%H:%M:%SZ"
 ITERATIONS = 60
 """Of the learner, for each number of workers that `compare` tries."""
 
@@ -98,7 +99,7 @@ def machine() -> dict[str, Any]:
         "kernels": torch.backends.cpu.get_cpu_capability(),
         "cores": os.cpu_count(),
         "load_average_before": os.getloadavg(),
-        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "time": time.strftime(TIME_FORMAT, time.gmtime()),
     }
 
 
@@ -121,7 +122,7 @@ class LearnerLoop(Stage):
         from oodil.pipeline.training import train
 
         environment, gail = run.config.environment, run.config.imitation.gail
-        demonstrations = random_demonstrations(environment.id)
+        demonstrations = random_demonstrations(environment)
         weights = np.linspace(0.1, 1.0, len(demonstrations))
         simulators = make_batch(environment.id, environment.dynamics, 1)
         reward = AdversarialReward(demonstrations, weights, gail.discriminator, simulators.max_episode_steps, 0)
@@ -130,9 +131,9 @@ class LearnerLoop(Stage):
         return {}
 
 
-def random_demonstrations(env_id: str, count: int = 10) -> Demonstrations:
+def random_demonstrations(environment: EnvironmentConfig, count: int = 10) -> Demonstrations:
     """Return demonstrations of random actions: what is imitated does not matter for speed, only how much of it."""
-    batch = make_batch(env_id, {}, count)
+    batch = make_batch(environment.id, environment.dynamics, count)
     num_states = batch.max_episode_steps + 1
     rng = np.random.default_rng(0)
     for n in range(count):

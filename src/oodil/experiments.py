@@ -4,12 +4,16 @@ A job executes its run inline, so as many runs are at work at once as the engine
 `oodil.whole_runs`.
 """
 
+import calendar
+import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import inf
 from pathlib import Path
+from typing import Any
 
-from oodil.bench import machine, raw_rate
+from oodil.bench import TIME_FORMAT, machine, raw_rate
 from oodil.orchestrator import check_inputs, open_run, read_run, refuse_to_replace
 from oodil.pipeline.artifacts import MADE, RESULTS, RunDirectory, encode_json, read_made, write_file
 from oodil.pipeline.errors import ConfigError, OodilError, StorageError
@@ -142,10 +146,7 @@ class Table:
         out.
         """
         path, earlier = self.folder / MADE, read_made(self.folder)
-        spent = {run.name: RunResults(self.opened(run)).seconds_ever() for run in self.runs}
-        for each in earlier:
-            for name, seconds in each["seconds"].items():
-                spent[name] = spent.get(name, 0) - seconds
+        spent = {run.name: _seconds_since(RunResults(self.opened(run)), run.name, earlier) for run in self.runs}
         seconds = {name: round(each, 1) for name, each in spent.items() if each > SHORTEST_S}
         if earlier and not seconds:
             return path
@@ -159,6 +160,21 @@ class Table:
         }
         write_file(path, encode_json([*earlier, circumstances]))
         return path
+
+
+def _seconds_since(results: RunResults, name: str, made: Sequence[Mapping[str, Any]]) -> float:
+    """Return what was spent on a run since the commands that are known; those before it was removed do not count."""
+    began = results.began_at()
+    known = [each["seconds"].get(name, 0.0) for each in made if _ended_at(each) > began]
+    return results.seconds_ever() - sum(known)
+
+
+def _ended_at(made: Mapping[str, Any]) -> float:
+    """Return the end of the second in which a command noted how it was made; infinity if it did not say."""
+    try:
+        return calendar.timegm(time.strptime(made.get("machine", {}).get("time"), TIME_FORMAT)) + 1.0
+    except (TypeError, ValueError):
+        return inf
 
 
 def _refuse_other_settings(run: Run) -> None:

@@ -46,7 +46,7 @@ class WholeRuns(Stage):
         own, chosen = read_run(folder / job), described["chosen"][job]
         parts, beside = described["parts"], described["beside"]
         stages = [stage for stage in stages_of(own.config) if stage.name in chosen]
-        shown, reasons = _Shown(own, stages, context), list[str]()
+        shown, failures = _Shown(own, stages, context), list[UnfinishedError]()
         while stages:
             for stage in [each for each in stages if not {other.name for other in stages}.intersection(each.inputs)]:
                 part = parts[job][stage.name]
@@ -59,21 +59,29 @@ class WholeRuns(Stage):
                     mates = [RunDirectory(folder / name) for name in others]
                     elsewhere = [path for path in beside if beside[path].get(stage.name) == part]
                     _take_over(stage, own, mates, [RunDirectory(folder.parent / path) for path in elsewhere])
-                    reason = _execute(stage, own, shown, context)
+                    failure = _execute(stage, own, shown, context)
                 stages.remove(stage)
-                if reason:
-                    reasons.append(reason)
+                if failure:
+                    failures.append(failure)
                     stages = _without_what_follows(stage, stages)
                 break
             else:
                 shown.wait()
-        if reasons:
-            raise RuntimeError("\n".join(reasons))
+        if failures:
+            raise _together(failures)
         return {}
 
 
-def _execute(stage: Stage, run: Run, observer: Observer, context: JobContext) -> str:
-    """Bring a stage to its finished artifact; return why it failed, or nothing."""
+def _together(failures: Sequence[UnfinishedError]) -> UnfinishedError:
+    """Return one failure of a run: all reasons, and at the end a line for each stage."""
+    reasons = {failure.stage: "\n".join(failure.failed.values()) for failure in failures}
+    lines = [f"{stage}: {reason.strip().splitlines()[-1]}" for stage, reason in reasons.items()]
+    is_final = all(failure.is_final for failure in failures)
+    return UnfinishedError("\n".join([*reasons.values(), *lines]), WholeRuns.name, reasons, is_final)
+
+
+def _execute(stage: Stage, run: Run, observer: Observer, context: JobContext) -> UnfinishedError | None:
+    """Bring a stage to its finished artifact; return how it failed, if it did."""
     # A failed job is tried again with its whole run, by the engine that runs the runs.
     runtime = run.config.runtime.model_copy(update={"max_attempts": 1})
     once = Run(run.config.model_copy(update={"runtime": runtime}), run.directory)
@@ -82,8 +90,8 @@ def _execute(stage: Stage, run: Run, observer: Observer, context: JobContext) ->
     except UnfinishedError as error:
         if not error.failed:
             raise JobStoppedError(str(error)) from None
-        return "\n".join(error.failed.values())
-    return ""
+        return error
+    return None
 
 
 def _without_what_follows(failed: Stage, stages: Sequence[Stage]) -> list[Stage]:

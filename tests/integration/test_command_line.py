@@ -153,6 +153,7 @@ def test_a_run_directory_of_another_run(tmp_path: Path) -> None:
     run_dir.mkdir()
     (run_dir / "thesis.tex").write_text("not ours")
     assert "is not empty and not a run" in refused("run", str(MICRO), "--run-dir", str(run_dir))
+    assert "is a file" in refused("run", str(MICRO), "--run-dir", str(run_dir / "thesis.tex"))
     shutil.rmtree(run_dir)
     result = CliRunner().invoke(
         app, ["run", str(MICRO), "--run-dir", str(run_dir), "--workers", "0", "--until", "demonstrations"]
@@ -175,6 +176,26 @@ def test_a_run_directory_of_another_run(tmp_path: Path) -> None:
     assert described["stages"]["imitation"]["state"] == "pending"
     shown = CliRunner().invoke(app, ["demos", "inspect", str(run_dir)]).output
     assert "7 demonstrations" in shown and "fast" in shown and "slow" in shown
+
+
+def test_what_would_not_be_computed_is_not_forced(tmp_path: Path) -> None:
+    words = "run", str(MICRO), "--run-dir", str(tmp_path / "run"), "--until", "clustering", "--force", "imitation"
+    assert "--force imitation: comes after --until clustering" in refused(*words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_places_where_nothing_can_be_written(tmp_path: Path) -> None:
+    file = tmp_path / "thesis.tex"
+    file.write_text("not ours")
+    assert f"{file}/allowed: Not a directory" in refused("keys", "new", str(file))
+    for output, message in ((file, "are written as FILE.safetensors"), (tmp_path / "no" / "a.safetensors", "no such")):
+        assert message in refused("demos", "collect", str(MICRO), "--output", str(output))
+    (tmp_path / "a.safetensors").mkdir()
+    assert "is a folder" in refused("demos", "collect", str(MICRO), "--output", str(tmp_path / "a.safetensors"))
+
+
+def test_a_worker_needs_an_address(tmp_path: Path) -> None:
+    assert "cannot connect to 'nonsense'" in refused("worker", "--connect", "nonsense", "--keys", str(tmp_path))
 
 
 @pytest.mark.parametrize("option", ["--until", "--force"])

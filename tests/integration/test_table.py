@@ -75,10 +75,15 @@ def test_what_is_computed_again_is_in_how_it_was_made(whole: Path, tmp_path: Pat
     shutil.copytree(whole, tmp_path / "micro")
     for finished in ("stages", "jobs"):
         shutil.rmtree(tmp_path / "micro" / "all-seed1" / finished / "imitation")
+    shutil.rmtree(tmp_path / "micro" / "some-seed0")
     run(*command(tmp_path, 1))
     earlier, again = json.loads((tmp_path / "micro" / "made.json").read_bytes())
     assert [earlier] == json.loads((whole / "made.json").read_bytes())
-    assert again["seconds"].keys() == {"all-seed1"}
+    assert again["seconds"].keys() == {"all-seed1", "some-seed0"}
+    anew = oodil.open_run(tmp_path / "micro" / "some-seed0").seconds_ever()
+    assert again["seconds"]["some-seed0"] == pytest.approx(anew, abs=0.1), "what was there before it counts no more"
+    run(*command(tmp_path, 1))
+    assert len(json.loads((tmp_path / "micro" / "made.json").read_bytes())) == 2
 
 
 @pytest.mark.parametrize(
@@ -186,7 +191,7 @@ def test_one_that_fails_leaves_the_others_alone_and_is_named(tmp_path: Path) -> 
     assert code == 1, output
     assert "0 runs done, 2 failed (only-seed0, other-seed0), 0 not finished" in output
     found = json.loads((tmp_path / "micro" / "results.json").read_bytes())
-    reason = "ArithmeticError: no weights today"
+    reason = "raising: ArithmeticError: no weights today"
     assert found["failed"] == [
         {"row": row, "seed": 0, "method": "never", "reason": reason} for row in ("only", "other")
     ]

@@ -1,5 +1,7 @@
 """The dispatcher with a clock of its own: who is given what, and when."""
 
+from dataclasses import replace
+
 import pytest
 
 from oodil.pipeline.collecting import collect
@@ -66,3 +68,17 @@ def test_a_failed_unit_returns_to_the_same_worker_only_if_there_is_no_other() ->
     assert names(units.assign(0.2)) == [("b", 0)]
     with pytest.raises(CollectError, match=r"(?s)failed 3 times, last in b.*third"):
         units.failed("b", (0, 0), "third", 0.3)
+
+
+def test_a_result_that_does_not_fit_is_a_failure_and_the_unit_goes_to_another() -> None:
+    units = dispatcher(1, "a", "b")
+    (given,) = units.assign(0.0)
+    assert given[0] == "a"
+    other = replace(hopper_units(0)[0], num_steps=3)
+    units.result("a", collect(other), 0.1)
+    assert units.dropped["mismatch"] == 1
+    assert names(units.assign(0.1)) == [("b", 0)]
+    units.result("a", collect(other), 0.2)  # It was not asked again, so this is nobody's failure.
+    assert units.assign(0.2) == []
+    units.result("b", inline(hopper_units(0)[:1])[0], 0.3)
+    assert units.dropped["mismatch"] == 2 and units.dropped["duplicate"] == 0

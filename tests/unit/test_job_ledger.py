@@ -3,8 +3,9 @@
 import pytest
 
 from oodil.pipeline.config import RuntimeConfig
+from oodil.pipeline.errors import DataError, UnfinishedError
 from oodil.workers.engine import Attempts, JobLedger, Outcome
-from oodil.workers.reports import DONE, STOPPED, AttemptFailed, Event, Finished, Progress, Started
+from oodil.workers.reports import DONE, STOPPED, AttemptFailed, Event, Finished, Progress, Started, failure
 
 
 def test_pauses_double_up_to_a_limit() -> None:
@@ -32,7 +33,7 @@ def test_only_attempts_that_get_no_further_are_used_up(reached: list[int], tried
     found = []
     for done in reached:
         attempts.begin()
-        attempts.reached(done)
+        attempts.reached(10 - done)
         found.append(attempts.failed("") is not None)
     assert found == tried_again
 
@@ -40,7 +41,7 @@ def test_only_attempts_that_get_no_further_are_used_up(reached: list[int], tried
 def test_the_pause_is_short_again_after_progress() -> None:
     attempts = Attempts(3, 1.0)
     assert [attempts.failed("first"), attempts.failed("second")] == [1.0, 2.0]
-    attempts.reached(1)
+    attempts.reached(9)
     assert attempts.failed("third") == 1.0
     assert attempts.first_reason == "first"
 
@@ -74,3 +75,26 @@ def test_after_a_stop_nothing_is_tried_again_and_nothing_has_failed() -> None:
     ledger.finished("b", STOPPED)
     assert ledger.failed("a", "killed") is None
     assert ledger.outcome() == Outcome(not_run=["a", "b"], stopped=True)
+
+
+def test_an_attempt_that_has_less_left_got_further_though_it_counts_anew() -> None:
+    """What earlier attempts have finished is no part of what a run of a table reports."""
+    ledger = JobLedger(["run"], RuntimeConfig(max_attempts=2), lambda event: None)
+    for done, total in ((900, 1000), (10, 50), (5, 20)):
+        ledger.begin("run")
+        ledger.report("run", Progress(done, total, {}))
+        assert ledger.failed("run", "killed") is not None
+    ledger.begin("run")
+    ledger.report("run", Progress(0, 20, {}))
+    assert ledger.failed("run", "killed") is None
+
+
+def test_what_cannot_be_used_is_not_tried_again() -> None:
+    ledger = JobLedger(["a", "b"], RuntimeConfig(), lambda event: None)
+    for job, error in (("a", DataError("a.npz: holds no states")), ("b", ArithmeticError("told to"))):
+        ledger.begin(job)
+        failed = failure(error)
+        assert (ledger.failed(job, failed.reason, failed.is_final) is None) == (job == "a")
+    assert ledger.outcome().failed == {"a": "a.npz: holds no states"} and ledger.outcome().is_final
+    assert failure(UnfinishedError("both", "table", {}, is_final=True)).is_final
+    assert not failure(UnfinishedError("both", "table", {})).is_final

@@ -17,9 +17,11 @@ def worker(
 ) -> None:
     """Collect rollouts for a run on another machine, until Ctrl-C; come and go as you like."""
     from oodil.terminal import stop_flag
+    from oodil.workers.channels import check_address
     from oodil.workers.keys import client_keys
     from oodil.workers.remote import WorkersError, serve
 
+    check_address(connect)
     client_keys(keys)
     with stop_flag(lambda: print("stopping")) as should_stop:
         try:
