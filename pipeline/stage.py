@@ -5,6 +5,7 @@ an engine (`oodil.workers.engine`) decides where its jobs run and who collects t
 """
 
 import importlib
+import sys
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
@@ -112,7 +113,7 @@ class Stage(ABC):
     @property
     def module(self) -> str:
         """The module that registers it; a process imports it before it runs a job of the stage."""
-        return type(self).__module__
+        return _MODULES.get(self.name, type(self).__module__)
 
     def check(self, config: RunConfig) -> None:  # noqa: B027 (most stages can always run)
         """Raise ConfigError, before any work, for a configuration in which this stage cannot run."""
@@ -177,13 +178,16 @@ class Stage(ABC):
 
 
 _REGISTRY: dict[str, Stage] = {}
+_MODULES: dict[str, str] = {}
+"""By stage, the module that registers it."""
 
 
 def register(stage: Stage) -> None:
     """Make a stage known by its name; the last line of the file that defines it."""
-    held = _REGISTRY.setdefault(stage.name, stage)
-    if held is not stage and held.module != stage.module:
-        raise ValueError(f"a stage {stage.name!r} is registered by {held.module} and by {stage.module}")
+    module = sys._getframe(1).f_globals["__name__"]  # The caller's: a class of ours may be a stage of somebody else.
+    held, holder = _REGISTRY.setdefault(stage.name, stage), _MODULES.setdefault(stage.name, module)
+    if held is not stage and holder != module:
+        raise ValueError(f"a stage {stage.name!r} is registered by {holder} and by {module}")
 
 
 _OURS = "oodil.pipeline.stages"

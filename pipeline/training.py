@@ -169,7 +169,7 @@ def train(
         lengths.extend(batch.episode_lengths)
         context.progress(
             env_steps,
-            config.num_iterations * config.steps_per_iteration,
+            config.env_steps,
             **metrics,
             **returns.mean("return"),
             **lengths.mean("length"),

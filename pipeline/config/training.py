@@ -132,6 +132,11 @@ class TrainingConfig(Section):
         """Iterations that reach ``total_steps``."""
         return -(-self.total_steps // self.steps_per_iteration)
 
+    @property
+    def env_steps(self) -> int:
+        """Environment steps of all iterations."""
+        return self.num_iterations * self.steps_per_iteration
+
 
 class GailConfig(TrainingConfig):
     """Adversarial imitation: training whose reward comes from a discriminator."""

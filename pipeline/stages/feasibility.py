@@ -96,7 +96,7 @@ class FeasibilityWeighting(Weighting):
             tracker = Tracker.load(run.job_artifact(self.name, job))
             found[tracker.demonstrations] = tracker.distances
             training = training_config(run.config, demonstrations.select(tracker.demonstrations), len(jobs))
-            env_steps += training.num_iterations * training.steps_per_iteration
+            env_steps += training.env_steps
         alpha = run.config.f_mdp.alpha
         scale = FeasibilityScale(float(found.min()), adaptive_alpha(found) if alpha is None else alpha)
         return _weighted(found, scale, env_steps).files() | scale.files()

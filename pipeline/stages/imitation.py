@@ -24,11 +24,6 @@ class ImitationStage(PolicyStage):
         super().__init__("imitation", title="ours", weighting=TransferabilityStage.name)
         self.inputs = (*self.inputs, ImitatorsStage.name)
 
-    @property
-    def module(self) -> str:
-        """This module."""
-        return type(self).__module__
-
     def check(self, config: RunConfig) -> None:
         """Refuse networks of other widths than those that are continued."""
         if config.imitation.warm_start:

@@ -109,7 +109,7 @@ class ImitatorsStage(Stage):
         policy = learner.behavior_policy()
         key = derive_key(cluster.seed, "distance")
         distance, measured = distance_of(policy, reward, config.environment, DISTANCE_EPISODES, key, starts)
-        env_steps = gail.num_iterations * gail.steps_per_iteration + measured
+        env_steps = gail.env_steps + measured
         trained = Imitator(policy, learner.value_arrays(), reward.discriminator_arrays(), distance, env_steps)
         return trained.files() | history.files()
 
@@ -128,7 +128,7 @@ class ImitatorsStage(Stage):
     def cost(self, config: RunConfig) -> Cost:
         """Return the cost of all imitators if no cluster is empty."""
         gail, jobs = config.transferability.gail, config.clustering.num_clusters * config.transferability.num_trainings
-        cost = Cost.of_training(jobs * gail.num_iterations * gail.steps_per_iteration, jobs)
+        cost = Cost.of_training(jobs * gail.env_steps, jobs)
         return replace(cost, episodes=jobs * DISTANCE_EPISODES)
 
 

@@ -72,7 +72,7 @@ class InverseDynamics(Weighting):
     def cost(self, config: RunConfig) -> Cost:
         """Return the cost of exploration; what the model and the demonstrations take comes on top."""
         how = _exploration(config)
-        return Cost(how.num_iterations * how.steps_per_iteration)
+        return Cost(how.env_steps)
 
     def run_job(self, run: Run, job: str, context: JobContext) -> Files:
         """Explore, learn the model, follow what was held out and every demonstration, and turn errors into scores."""
@@ -98,7 +98,7 @@ class InverseDynamics(Weighting):
             pace.advance()
         held_out, own = np.split(errors, [num_held_out])
         found = Following(own, *error_bounds(own, held_out), model.arrays())
-        steps = _exploration(config).num_iterations * _exploration(config).steps_per_iteration
+        steps = _exploration(config).env_steps
         return judged(found, own, steps + int((both.lengths - 1).sum())).files() | found.files()
 
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:

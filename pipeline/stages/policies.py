@@ -45,11 +45,6 @@ class PolicyStage(Stage):
         self.weighting = weighting
         self.inputs = ("demonstrations",) if weighting is None else ("demonstrations", weighting)
 
-    @property
-    def module(self) -> str:
-        """The module that registers its weighting; one without a weighting is registered here."""
-        return super().module if self.weighting is None else stage_named(self.weighting).module
-
     def settings(self, config: RunConfig) -> dict[str, Any]:
         """Return the number of trainings and what each depends on."""
         return self.job_settings(config) | {"num_trainings": config.imitation.num_trainings}
@@ -83,7 +78,7 @@ class PolicyStage(Stage):
     def cost(self, config: RunConfig) -> Cost:
         """Return the cost of all trainings, and of the episodes by which they are measured."""
         gail, jobs, evaluation = self.gail(config), config.imitation.num_trainings, config.evaluation
-        cost = Cost.of_training(jobs * gail.num_iterations * gail.steps_per_iteration, jobs)
+        cost = Cost.of_training(jobs * gail.env_steps, jobs)
         return replace(
             cost,
             episodes=jobs * (config.imitation.num_candidates * CANDIDATE_EPISODES + DISTANCE_EPISODES),
@@ -107,7 +102,7 @@ class PolicyStage(Stage):
         config, evaluation = run.config, run.config.evaluation
         environment, gail = config.environment, self.gail(config)
         spec = environment_spec(environment.id, environment.dynamics)
-        # The same seeds for all policies: they differ in their weights alone.
+        # The same seeds for all policies: they differ in their weights, and in where `begin` brings them.
         seed = torch_seed(derive_key(config.seed, "imitation", job))
         demonstrations, weights = self.demonstrations(run), self.weights(run)
         learner = imitator(
@@ -131,7 +126,7 @@ class PolicyStage(Stage):
             action_low=spec.action_low,
             action_high=spec.action_high,
             acts_in_integers=spec.acts_in_integers,
-            env_steps=gail.num_iterations * gail.steps_per_iteration,
+            env_steps=gail.env_steps,
         )
         mean, std, length = np.concatenate([*known, history.values("curve").ravel()]).reshape(-1, 3).T
         steps = np.concatenate([np.zeros(len(known), np.int64), history.steps("curve")])
@@ -156,7 +151,7 @@ class PolicyStage(Stage):
 
 
 class AllStepsPolicy(PolicyStage):
-    """A policy with as many environment steps as our method takes in all, the imitators of its clusters included."""
+    """A policy with as many environment steps as all our trainings take, those of the clusters' imitators included."""
 
     def gail(self, config: RunConfig) -> GailConfig:
         """Return the training of our policy, with its share of the clusters' steps."""

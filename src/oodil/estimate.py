@@ -15,14 +15,14 @@ from oodil.pipeline.environments import Simulators, make_batch
 from oodil.pipeline.errors import UnusableEnvironmentError
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.stage import Run, Stage, state_of
+from oodil.pipeline.stages import stages as stages_of
 
 MEASURED_S = 0.3
 """Seconds for which the environment is stepped."""
 START_S = 2.0
 """Seconds that a stage takes to load what it computes with, and to write what it has found."""
 REFERENCE_STEPS_PER_S = 15_000
-"""Of Hopper on one core of the machine that the constants of `oodil.pipeline.stage.Cost` and the documents' times are
-from."""
+"""Of Hopper on one core of the machine that the constants of `oodil.pipeline.stage.Cost` are from."""
 
 
 @dataclass(frozen=True)
@@ -112,17 +112,23 @@ def outlook(table: Table, selected: dict[str, list[Stage]]) -> list[Outlook]:
     runs = {run.name: run for run in table.runs}
     found = [(RunResults(table.opened(run)), run.parts) for run in table.runs]
     found += [(RunResults(read_run(table.folder.parent / path)), parts) for path, parts in table.beside.items()]
-    done = {part for results, parts in found for stage, part in parts.items() if results.is_done(stage)}
+    # Two stages that do the same may have different numbers of jobs, such as trainings: the more there are the better.
+    done: dict[str, int] = {}
+    for results, parts in found:
+        for stage in stages_of(results.config):
+            if stage.name in parts and results.is_done(stage.name):
+                _note_jobs(done, parts[stage.name], stage, results.config)
     paces: dict[str, Pace] = {}
-    taken: set[str] = set()
+    taken: dict[str, int] = {}
     outlooks = []
     for name, stages in selected.items():
         parts, config = runs[name].parts, runs[name].config
         kinds: dict[str, list[Stage]] = {"finished": [], "shared": [], "own": []}
         for stage in stages:
-            part = parts[stage.name]
-            kinds["finished" if part in done else "shared" if part in taken else "own"].append(stage)
-            taken.add(part)
+            part, jobs = parts[stage.name], stage.cost(config).jobs
+            is_done, is_taken = (jobs <= known.get(part, 0) for known in (done, taken))
+            kinds["finished" if is_done else "shared" if is_taken else "own"].append(stage)
+            _note_jobs(taken, part, stage, config)
         environment = fingerprint([config.environment.id, config.environment.settings()])
         if environment not in paces:
             paces[environment] = pace_of(config)
@@ -132,6 +138,10 @@ def outlook(table: Table, selected: dict[str, list[Stage]]) -> list[Outlook]:
         names = {kind: [stage.name for stage in those] for kind, those in kinds.items()}
         outlooks.append(Outlook(name, cost, **names))
     return outlooks
+
+
+def _note_jobs(known: dict[str, int], part: str, stage: Stage, config: RunConfig) -> None:
+    known[part] = max(known.get(part, 0), stage.cost(config).jobs)
 
 
 def table_cost(found: Sequence[Outlook], workers: int | None) -> RunCost:

@@ -1,13 +1,16 @@
 """What is computed again, and what is not: each field of the configuration that changes a result, and no other."""
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import oodil
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.stage import Run, stage_named
+from oodil.pipeline.stages import stages
 from oodil.pipeline.stages.experts import ExpertsStage
 from tests.runs import MICRO
 
@@ -147,3 +150,84 @@ def test_a_stale_stage_is_shown_and_not_used(run_dir: Path) -> None:
             use()
     assert results.policy("naive_gail")
     assert "imitation" not in results.summary()["policies"]
+
+
+ALL = "baselines=[naive_gail, naive_gail_all_steps, f_mdp, f_mdp_per_source, id_random, id_gail, exact_id, oracle]"
+WORDS = {
+    "contrastive": "states",
+    "fixed_length": "fixed_stride",
+    "sum": "mean",
+    "silhouette": "kmeans",
+    "step_first": "centers_first",
+    "fresh": "last",
+    "trpo": "ppo",
+    "change": "raw",
+}
+WIDTHS = ("imitation.gail.policy_hidden", "imitation.gail.value.hidden")
+NOT_ALONE = {
+    *WIDTHS,  # The imitators' change with them.
+    *(width.replace("imitation", "transferability") for width in WIDTHS),
+    "environment.id",
+    "demonstrations.file",  # There are sources.
+    "demonstrations.labels",
+    "demonstrations.transferable",
+    "demonstrations.unmarked",
+    "demonstrations.sources.0.expert",
+    "demonstrations.sources.1.expert",
+    "demonstrations.sources.0.label",  # Reported, as is tested above.
+    "demonstrations.sources.1.label",
+    "demonstrations.sources.0.transferable",  # The oracle needs one.
+    "oracle_target",
+    "preset",  # The fields that it sets are flipped themselves.
+}
+"""Fields that cannot be changed alone, or need more than another number or word."""
+
+
+def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every value of nested mappings and lists of mappings with its path."""
+    if isinstance(values, list) and values and isinstance(values[0], dict):
+        values = dict(enumerate(values))
+    if isinstance(values, dict):
+        for name, value in values.items():
+            yield from leaves(value, f"{path}.{name}" if path else name)
+    else:
+        yield path, values
+
+
+def others(value: Any) -> list[Any]:
+    """Return values that a field might have instead."""
+    if isinstance(value, bool):
+        return [not value]
+    if isinstance(value, int):
+        return [value + 1, value - 1, 2 * value]
+    if isinstance(value, float):
+        return [0.5 * value, 0.9 * value, value + 0.1]
+    if isinstance(value, list):
+        return [[2 * each for each in value if isinstance(each, int)]]
+    return [0.5, 1] if value is None else [WORDS[value]] if value in WORDS else []
+
+
+def test_every_field_that_changes_a_result_is_seen_by_a_stage() -> None:
+    """One that is forgotten would change a result under an old fingerprint; name and seed are in every origin."""
+
+    def settings(*overrides: str) -> tuple[Any, list[Any]]:
+        config = oodil.load_config(MICRO, [ALL, "reproducibility={}", *overrides])
+        return config, [stage.settings(config) for stage in (*stages(config), ExpertsStage())]
+
+    config, before = settings()
+    unseen, not_alone = set(), set()
+    of_no_result = {"name", "seed", "baselines", "evaluation", "runtime", "finetuning"}
+    for path, value in leaves(config.model_dump(mode="json", exclude=of_no_result)):
+        for other in others(value):
+            try:
+                changed, after = settings(f"{path}={json.dumps(other)}")
+            except oodil.OodilError:
+                continue
+            if changed != config:
+                if after == before:
+                    unseen.add(path)
+                break
+        else:
+            not_alone.add(path)
+    assert not unseen
+    assert not_alone == NOT_ALONE

@@ -87,7 +87,7 @@ def test_what_is_not_known_is_named(run_dir: Path, tmp_path: Path) -> None:
         oodil.load_config(MICRO, ["baselines=['tests.toi:far']"])
     with pytest.raises(oodil.OodilError, match=r"no policy 'transferability'; there are exact_id, .*, imitation"):
         oodil.load_config(MICRO, ["baselines=[transferability]"])
-    with pytest.raises(oodil.OodilError, match="no stage 'naive_gail'; this run has"):
+    with pytest.raises(oodil.OodilError, match="no policy 'naive_gail'; this run has"):
         oodil.open_run(run_dir).policy("naive_gail")
 
 
@@ -104,3 +104,19 @@ def test_a_method_of_the_running_script_says_that_workers_cannot_import_it(tmp_p
         [sys.executable, "-c", program, str(MICRO), str(tmp_path / "run")], cwd=ROOT, capture_output=True, text=True
     )
     assert "mine is defined in the script that runs; put it into a module of its own, or use workers=0" in done.stderr
+
+
+def test_a_policy_of_our_class_is_known_by_the_module_that_registers_it(tmp_path: Path) -> None:
+    """A worker process imports that module, whatever the class and the weighting are."""
+    (tmp_path / "theirs.py").write_text(
+        "import oodil\n"
+        "oodil.register(oodil.PolicyStage('again', title='again', weighting='transferability'))\n"
+        "oodil.register(oodil.PolicyStage('plain', title='plain', weighting=None))\n"
+    )
+    program = (
+        "import theirs\n"
+        "from oodil.pipeline.stage import stage_named\n"
+        "print(*(stage_named(name).module for name in ('again', 'plain', 'imitation')))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["theirs", "theirs", "oodil.pipeline.stages.imitation"]

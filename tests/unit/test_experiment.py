@@ -102,6 +102,17 @@ def test_only_what_the_methods_need_is_computed(experiment, tmp_path):
     assert not list(tmp_path.glob("micro*"))
 
 
+def test_more_trainings_of_the_same_are_not_taken_for_what_is_there(experiment, tmp_path):
+    rows = {str(count): {"transferability.num_trainings": count} for count in (1, 2)}
+    table = Table.of(experiment(rows=rows, methods=["imitation"], seeds=3), tmp_path / "micro")
+    chosen = table.select(None, None)
+    assert list(chosen) == ["2-seed3", "1-seed3"]
+    two, one = outlook(table, chosen)
+    assert "imitators" in two.own and "imitators" in one.shared
+    one, two = outlook(table, dict(reversed(chosen.items())))
+    assert "imitators" in one.own and "imitators" in two.own, "of two trainings one is there"
+
+
 def test_what_follows_from_a_failed_stage_is_left_out(experiment):
     (run, *_) = plan(experiment())
     stages = run.stages(["imitation", "naive_gail"])

@@ -114,14 +114,14 @@ def test_what_a_run_costs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     run = Run(config, RunDirectory(tmp_path))
     found: dict[str, Any] = run_cost(run, choose(config), workers=2).stages
     gail = config.transferability.gail
-    steps = gail.num_iterations * gail.steps_per_iteration
+    steps = gail.env_steps
     # Each is measured by 16 episodes.
     assert found["imitators"].env_steps == 5 * (steps + 16_000)
     # Five jobs on two workers: three rounds.
     seconds = (steps + 16_000) * 1e-3 + steps * 2 * LEARNING_S
     assert found["imitators"].seconds == pytest.approx(estimate.START_S + 3 * seconds)
     gail = config.imitation.gail
-    steps = gail.num_iterations * gail.steps_per_iteration
+    steps = gail.env_steps
     # Eight candidates by 8 episodes each, the policy by 16.
     assert found["imitation"].env_steps == steps + 80_000
     # One learner, whose workers share the work. Its curve is of two points by 2 episodes each, its end of 2 more.
