@@ -18,7 +18,7 @@ from oodil.pipeline.environments import EnvironmentSpec, Simulators
 Floats = NDArray[np.float64]
 
 PERTURBATION = 0.1
-"""Of an action for its derivatives; actions are counted from the middle of their range in halves of it."""
+"""Of an action for its derivatives; actions are in the units of simulators, [-1, 1] between two bounds."""
 DAMPING = 1e-3
 """Added to the squared derivatives, deviations per half range, so that actions without effect stay where they are."""
 ATTEMPTS, NEAR = 3, 0.01
@@ -58,11 +58,8 @@ class Follower:
         """Steps of all simulators so far."""
         self._simulators = simulators
         self._iterations = iterations
-        low, high = (bound.astype(np.float64) for bound in spec.bounds())
-        bounded = np.isfinite(low) & np.isfinite(high)
-        self._middle = np.where(bounded, (low + high) / 2, 0.0)
-        self._half = np.where(bounded, (high - low) / 2, 1.0)
-        self._bounds = (low - self._middle) / self._half, (high - self._middle) / self._half
+        low, high = spec.bounds()
+        self._bounds = low.astype(np.float64), high.astype(np.float64)
 
     def residuals(
         self, states: Floats, num_trials: int, horizon: int, units: Callable[[int], Floats], rng: np.random.Generator
@@ -111,11 +108,11 @@ class Follower:
         return _rows(_joined(parts), np.arange(len(states)))
 
     def _stepped(self, here: Snapshot, actions: Floats) -> tuple[Snapshot, Floats]:
-        """Return where R simulators stand after (R, A) actions, counted in halves, and what is then observed (R, S)."""
+        """Return where R simulators stand after (R, A) actions, and what is then observed (R, S)."""
         parts, seen = [], []
         for rows in self._turns(len(actions)):
             self._simulators.restore(_rows(here, rows))
-            self._simulators.step(self._middle + self._half * actions[rows])
+            self._simulators.step(actions[rows])
             self.env_steps += len(rows)
             parts.append(self._simulators.snapshot())
             seen.append(self._simulators.observations())

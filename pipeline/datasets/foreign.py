@@ -73,6 +73,8 @@ def check_output(output: Path, sources: Sequence[str]) -> None:
     """Raise DataError, before any work, for a file that is no place for demonstrations, or one of the sources."""
     if output.suffix != ".safetensors":
         raise DataError(f"{output}: demonstrations are written as FILE.safetensors")
+    if output.is_dir():
+        raise DataError(f"{output}: is a folder")
     if not output.absolute().parent.is_dir():
         raise DataError(f"{output.parent}: no such folder")
     paths = [Path(source) for source in sources if not source.startswith(_MINARI)]

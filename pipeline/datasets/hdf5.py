@@ -84,7 +84,7 @@ def _mark(file: Any, transferable: NDArray[np.bool_], columns: Mapping[str, NDAr
     masks = {"transferable": transferable}
     masks |= {f"cluster_{k}": columns["cluster"] == k for k in np.unique(columns["cluster"])}
     for mask, members in masks.items():
-        file[f"mask/{OURS}{mask}"] = np.array(names[members], "S")
+        file[f"mask/{OURS}{mask}"] = np.array([name.encode() for name in names[members]], "S")
     for n, name in enumerate(found):
         attributes = group[name].attrs
         for old in [each for each in attributes if each.startswith(OURS)]:

@@ -40,4 +40,7 @@ def read(path: Path, keys: tuple[str, ...], warn: Warn) -> list[Episode]:
         raise DataError(f"not a sound parquet file ({error})") from error
     rows: dict[str, NDArray] = {name: table[name].to_numpy() for name in wanted}
     order = np.lexsort([rows[name] for name in (_FRAME, _EPISODE) if name in rows])
-    return columns.read({name: values[order] for name, values in rows.items()}, keys, warn)
+    try:
+        return columns.read({name: values[order] for name, values in rows.items()}, keys, warn)
+    except ValueError as error:
+        raise DataError(f"rows of a column have different sizes, or none ({error})") from error

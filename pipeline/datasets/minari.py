@@ -25,15 +25,18 @@ def read(dataset_id: str, keys: tuple[str, ...]) -> tuple[list[Episode], str]:
     """
     dataset = _local(dataset_id)
     episodes = []
-    for n, episode in enumerate(dataset.iterate_episodes()):
-        nested = isinstance(episode.observations, dict | tuple)
-        # A terminated episode may have ended in success: whether it is a failure, only its owner knows.
-        parts = {
-            STATES[0]: episode.observations,
-            "rewards": episode.rewards,
-            TERMINATED[0]: episode.terminations,
-        }
-        episodes.append(layouts.episode(parts, keys if nested else (), f"demonstration {n}"))
+    try:
+        for n, episode in enumerate(dataset.iterate_episodes()):
+            nested = isinstance(episode.observations, dict | tuple)
+            # A terminated episode may have ended in success: whether it is a failure, only its owner knows.
+            parts = {
+                STATES[0]: episode.observations,
+                "rewards": episode.rewards,
+                TERMINATED[0]: episode.terminations,
+            }
+            episodes.append(layouts.episode(parts, keys if nested else (), f"demonstration {n}"))
+    except (OSError, KeyError, ValueError) as error:
+        raise DataError(f"not a sound Minari data set ({type(error).__name__}: {error})") from error
     return episodes, dataset.env_spec.id if dataset.env_spec is not None else ""
 
 

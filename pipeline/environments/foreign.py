@@ -7,7 +7,9 @@ Letters: S observation, A action, T steps of the episode so far.
 """
 
 import struct
+import weakref
 import zlib
+from contextlib import suppress
 from typing import Any
 
 import gymnasium
@@ -81,6 +83,11 @@ def unplaceable(env_id: str) -> str:
     return f"environment {env_id!r} cannot be put into an observed state: its class has no method place(observation)"
 
 
+def _close(env: gymnasium.Env[Any, Any]) -> None:
+    with suppress(Exception):
+        env.close()
+
+
 class ForeignEnvironment:
     """A Gymnasium environment and the episode that it is in.
 
@@ -97,6 +104,8 @@ class ForeignEnvironment:
         self._middle, self._half = action_units(self._low, self._high)
         self._acts_in_integers = takes_integers(self._space)
         self._kinds = "biu" if np.dtype(self._seen.dtype).kind in "biu" else "biuf"
+        self._closing = weakref.finalize(self, _close, env)
+        self._closing.atexit = False
         self.observation_dim = int(np.prod(self._seen.shape))
         self.action_dim = int(np.prod(self._space.shape))
         self.can_be_placed = can_be_placed(env)
@@ -191,11 +200,8 @@ class ForeignEnvironment:
             raise UnusableEnvironmentError(f"environment {self.env_id!r} cannot be filmed: {error}") from error
 
     def close(self) -> None:
-        """Let go of what it holds; one that fails to do so is let go of anyway."""
-        try:
-            self._env.close()
-        except Exception:
-            return
+        """Let go of what it holds; one that fails to do so is let go of anyway. It is also done when nobody is left."""
+        self._closing()
 
     def _refuse_other(self, mark: float, again: float, length: int) -> None:
         if mark != again:

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import half_cheetah_v5, hopper_v5, walker2d_v5
+from gymnasium.utils import EzPickle
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
@@ -74,6 +75,7 @@ class HopperEnv(hopper_v5.HopperEnv):
         if not 0 < gravity < np.inf:
             raise ValueError(f"gravity is {gravity}; it must be positive and finite (m/s^2, downwards)")
         super().__init__(exclude_current_positions_from_observation=False, **kwargs)
+        EzPickle.__init__(self, gravity=gravity, **kwargs)  # in the place of what the parent has noted
         follow(self.mujoco_renderer)
         self.model.opt.gravity[2] = -gravity
 
@@ -108,6 +110,7 @@ class Walker2dEnv(walker2d_v5.Walker2dEnv):
         if not 0 < friction < np.inf:
             raise ValueError(f"friction is {friction}; it must be positive and finite")
         super().__init__(exclude_current_positions_from_observation=False, **kwargs)
+        EzPickle.__init__(self, friction=friction, **kwargs)  # in the place of what the parent has noted
         follow(self.mujoco_renderer)
         for foot in ("foot_geom", "foot_left_geom"):
             self.model.geom(foot).friction[0] = friction
@@ -141,6 +144,7 @@ class HalfCheetahEnv(half_cheetah_v5.HalfCheetahEnv):
         if not (0 <= front < np.inf and 0 <= back < np.inf):
             raise ValueError(f"front and back are {front} and {back}; a motor's scale must be finite and not negative")
         super().__init__(exclude_current_positions_from_observation=False, **kwargs)
+        EzPickle.__init__(self, front=front, back=back, **kwargs)  # in the place of what the parent has noted
         follow(self.mujoco_renderer)
         for actuator in range(self.model.nu):
             name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator)

@@ -100,6 +100,21 @@ def test_a_minari_data_set(minari_id: str, states: list[np.ndarray]) -> None:
     assert read_foreign(minari_id, "mine", (), ends_are_failures=True)[0].terminated.tolist() == [False, True, False]
 
 
+def test_a_truncated_minari_data_set_is_one_message(minari_id: str, tmp_path: Path) -> None:
+    (file,) = (tmp_path / "minari").rglob("main_data.hdf5")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(DataError, match=r"not a sound Minari data set .OSError"):
+        read_foreign(minari_id, "mine", (), ends_are_failures=False)
+
+
+def test_a_minari_data_set_without_rewards_is_one_message(minari_id: str, tmp_path: Path) -> None:
+    (file,) = (tmp_path / "minari").rglob("main_data.hdf5")
+    with h5py.File(file, "r+") as opened:
+        del opened["episode_1/rewards"]
+    with pytest.raises(DataError, match=r"not a sound Minari data set .KeyError"):
+        read_foreign(minari_id, "mine", (), ends_are_failures=False)
+
+
 def test_a_robomimic_file(robomimic_file: Path, states: list[np.ndarray]) -> None:
     found, environment = read_foreign(str(robomimic_file), "lab", ("arm", "box"), ends_are_failures=False)
     assert_same(found, states)

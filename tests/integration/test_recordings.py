@@ -109,6 +109,14 @@ def test_an_hdf5_demonstration_that_cannot_be_used_is_named(tmp_path: Path) -> N
         read(path, "robot/arm")
 
 
+def test_masks_name_demonstrations_in_any_alphabet(tmp_path: Path) -> None:
+    path = groups(tmp_path / "lab.hdf5", robomimic, "data/d\N{LATIN SMALL LETTER E WITH ACUTE}mo_{}")
+    export(read(path, "robot/arm"), FOUND, str(path))
+    with h5py.File(path) as file:
+        (first, third) = file["mask/oodil_cluster_2"][:]
+    assert (first.decode(), third.decode()) == ("d\xe9mo_0", "d\xe9mo_10")
+
+
 def test_columns_of_d4rl(tmp_path: Path) -> None:
     last = np.isin(np.arange(len(STATES)), np.cumsum(LENGTHS) - 1)
     with h5py.File(tmp_path / "a.hdf5", "w") as file:
@@ -228,6 +236,26 @@ def test_a_folder_of_lerobot(tmp_path: Path) -> None:
         read(tmp_path / "set", "observation.pose")
     with pytest.raises(DataError, match=r"is a folder, and none of LeRobot's"):
         read(tmp_path)
+
+
+@pytest.mark.parametrize("row", [None, [0.5], [0.5, np.nan, 0.5]])
+def test_rows_of_lerobot_that_are_no_states_are_refused(tmp_path: Path, row: Any) -> None:
+    states = STATES.tolist()
+    states[3] = row
+    table = pyarrow.table({"observation.state": states, "episode_index": np.repeat(np.arange(4), LENGTHS)})
+    pyarrow.parquet.write_table(table, tmp_path / "a.parquet")
+    with pytest.raises(DataError, match=r"different sizes, or none|must be finite"):
+        read(tmp_path / "a.parquet")
+
+
+def test_a_truncated_parquet_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.parquet"
+    pyarrow.parquet.write_table(
+        pyarrow.table({"observation.state": STATES.tolist(), "episode_index": np.repeat(np.arange(4), LENGTHS)}), path
+    )
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(DataError, match="not a sound parquet file"):
+        read(path)
 
 
 # The command

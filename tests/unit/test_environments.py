@@ -1,5 +1,7 @@
 """The batched simulators against Gymnasium, step by step and to the bit; snapshots; dynamics that really change."""
 
+import copy
+import pickle
 import time
 
 import gymnasium
@@ -179,6 +181,27 @@ def test_a_snapshot_continues_to_the_same_bits(env_id, dynamics, size, assert_sa
 def test_a_snapshot_of_another_size_is_refused(taken_from):
     with pytest.raises(ValueError, match="snapshot"):
         make_batch(HOPPER, {}, 3).restore(make_batch(HOPPER, {}, taken_from).snapshot())
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize(
+    ("env_id", "dynamics"),
+    [(HOPPER, {"gravity": 7.0}), (WALKER, {"friction": 3.0}), (CHEETAH, {"front": 0.5, "back": 0.9})],
+)
+def test_an_environment_can_be_copied_with_its_dynamics(env_id, dynamics, copied):
+    env, plain = gymnasium.make(env_id, **dynamics).unwrapped, gymnasium.make(env_id).unwrapped
+    other = copied(env)
+
+    def physics(task):
+        return np.concatenate([part.ravel() for part in task_parts(task.model)])
+
+    assert np.array_equal(physics(other), physics(env)) and not np.array_equal(physics(other), physics(plain))
+    assert other.observation_space == env.observation_space
+
+
+def task_parts(model):
+    """Return what dynamics change in a model."""
+    return model.opt.gravity, model.geom_friction, model.geom_priority, model.actuator_gear
 
 
 def test_a_snapshot_of_another_model_is_refused():

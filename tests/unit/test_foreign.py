@@ -12,7 +12,7 @@ from oodil.pipeline.config import EnvironmentConfig
 from oodil.pipeline.environments import check_environment, environment_spec, make_batch
 from oodil.pipeline.errors import UnusableEnvironmentError
 from oodil.pipeline.policy import GaussianPolicy
-from oodil.pipeline.records import random_return
+from oodil.pipeline.records import EPISODES, random_return
 from oodil.pipeline.results import Policy
 
 ODD = "tests.odd_environments:odd/{}-v0"
@@ -118,6 +118,20 @@ def test_one_that_a_process_can_hold_once_is_refused(monkeypatch: pytest.MonkeyP
     message = r"made only once in a process .OSError: the device is busy.*cannot be used"
     with pytest.raises(UnusableEnvironmentError, match=message):
         check_environment(ODD.format("Single"), {})
+
+
+def test_simulators_that_nobody_holds_any_more_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They may hold a process, a client or a file, and a training makes hundreds."""
+    closed: list[object] = []
+    monkeypatch.setattr(tests.odd_environments.Carts, "close", lambda env: closed.append(env))
+    random_return(EnvironmentConfig(id=ODD.format("Strong")))
+    count = len(closed)
+    assert count >= EPISODES
+    batch = make_batch(ODD.format("Strong"), {}, 2)
+    batch.close()
+    batch.close()
+    del batch
+    assert len(closed) == count + 2
 
 
 @pytest.mark.parametrize(
