@@ -62,7 +62,7 @@ def measure(name: str, count: int, section: ReproducibilityConfig) -> dict[str, 
         row = {
             "source": source.label,
             "transferable": source.transferable,
-            "reproducible": reproducible[demonstrations.source_labels[i]],
+            "reproducible": reproducible[i],
             "clipped_states": round(float(1 - told[states_of == i].mean()), 3),
             "one_step": described(found.one_step[mine]),
             "horizon": described(found.horizon[mine]),

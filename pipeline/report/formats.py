@@ -22,7 +22,7 @@ def spread(std: float, mean: float) -> str:
     """Return a standard deviation of episode returns in digits that suit their mean; a dash where it is not finite."""
     if not math.isfinite(std):
         return UNKNOWN
-    return f"{std:,.0f}" if abs(mean) >= 100 else f"{std:.2g}"
+    return f"{std:,.0f}" if max(abs(mean), 10 * std) >= 100 else f"{std:.2g}"
 
 
 def decimal(value: float | None, digits: int = 3) -> str:
@@ -49,6 +49,6 @@ def duration(seconds: float) -> str:
 def count(value: float) -> str:
     """Return a number of steps in a few characters, such as 2.5 M."""
     for unit, name in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if abs(value) >= unit:
+        if abs(value) >= 0.9995 * unit:  # in three digits, what is just below is the unit
             return f"{value / unit:.3g}{SPACE}{name}"
     return f"{value:.0f}"

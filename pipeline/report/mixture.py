@@ -1,5 +1,6 @@
 """What the policies learn from: how the sources share the drawn transitions under each weighting."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,11 +60,11 @@ def read_mixture(found: Findings, sources: Sources) -> Mixture:
         columns.append("can be reproduced (distance)")
         values.append(
             [
-                f"{'yes' if chosen[label] else 'no'} ({distance:.3f})" if np.isfinite(distance) else "not known"
-                for label, distance in known.by_source(sources.demonstrations).items()
+                f"{'yes' if is_reproducible else 'no'} ({distance:.3f})" if np.isfinite(distance) else "not known"
+                for is_reproducible, distance in zip(chosen, known.by_source(sources.demonstrations), strict=True)
             ]
         )
-        told = _reproducible(chosen)
+        told = _reproducible(sources.demonstrations.source_labels, chosen)
     return Mixture(
         reproducibility=told,
         bars=tuple(
@@ -74,9 +75,9 @@ def read_mixture(found: Findings, sources: Sources) -> Mixture:
     )
 
 
-def _reproducible(sources: dict[str, bool]) -> str:
-    """Say of which sources, by label, the imitator's simulator can follow every step."""
-    if all(sources.values()):
+def _reproducible(labels: Sequence[str], chosen: Sequence[bool]) -> str:
+    """Say of which sources the imitator's simulator can follow every step."""
+    if all(chosen):
         return "Every source can be reproduced: the imitator's simulator can follow its demonstrations."
-    missing = ", ".join(label or "unnamed" for label, known in sources.items() if not known)
+    missing = ", ".join(label or "unnamed" for label, known in zip(labels, chosen, strict=True) if not known)
     return f"The imitator's simulator cannot follow the demonstrations of: {missing}."

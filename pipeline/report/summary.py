@@ -163,7 +163,7 @@ def cards(found: Findings) -> list[Card]:
         stability = f"{formats.percent(diagnostics.label_stability)} of their labels survive another draw"
         shown.append(Card("Clusters", f"{diagnostics.non_empty_clusters}", f"{in_use}; {stability}"))
     steps = formats.count(env_steps) if env_steps else formats.UNKNOWN
-    shown.append(Card("Environment steps", steps, "in all trainings"))
+    shown.append(Card("Environment steps", steps, "of trainings, and of the episodes by which they are measured"))
     time = formats.duration(seconds) if seconds else formats.UNKNOWN
     shown.append(Card("Time", time, "of all finished stages"))
     return shown
@@ -203,6 +203,14 @@ def notes(found: Findings) -> list[Note]:
     if len(set(env_steps.values())) > 1:
         named = ", ".join(f"{found.title(name)} {formats.count(steps)}" for name, steps in env_steps.items())
         told.append(Note(f"The policies were trained for different numbers of environment steps ({named})."))
+    if "imitation" in found.finals and len(found.finals) > 1 and results.config.imitation.warm_start:
+        steps = results.env_steps()
+        ours = sum(steps.get(name, 0) for name in ("imitators", "transferability", "imitation"))
+        text = (
+            "Our policy goes on from the imitator of a cluster, where the others begin anew. With all imitators and "
+            f"the readings of their scores, ours took {formats.count(ours)} environment steps."
+        )
+        told.append(Note(text))
     if found.sources and not found.sources.fully_marked:
         text = (
             "Not every source is marked as transferable or not transferable, so neither AUROC nor the transferable "

@@ -55,22 +55,18 @@ class Reproducibility:
         """Return (N,) the mean distance after several steps of each demonstration."""
         return np.asarray(self.horizon.mean(axis=1))
 
-    def horizon_median(self) -> NDArray[np.float64]:
-        """Return (N,) the median distance after several steps of each demonstration."""
-        return np.asarray(np.median(self.horizon, axis=1))
-
-    def by_source(self, demonstrations: Demonstrations) -> dict[str, float]:
-        """Return by source the distance, after one step, that `SHARE` of its trials keep; NaN where none is known."""
-        found = {}
-        for source, label in enumerate(demonstrations.source_labels):
+    def by_source(self, demonstrations: Demonstrations) -> list[float]:
+        """Return for each source the distance, after one step, that `SHARE` of its trials keep; NaN if not known."""
+        found = []
+        for source in range(len(demonstrations.source_labels)):
             trials = self.one_step[demonstrations.sources == source]
             trials = trials[np.isfinite(trials)]
-            found[label] = float(np.quantile(trials, self.SHARE)) if trials.size else float("nan")
+            found.append(float(np.quantile(trials, self.SHARE)) if trials.size else float("nan"))
         return found
 
-    def reproducible_sources(self, demonstrations: Demonstrations) -> dict[str, bool]:
-        """Return by source whether it is reproducible; what is not known is not."""
-        return {label: kept <= self.LIMIT for label, kept in self.by_source(demonstrations).items()}
+    def reproducible_sources(self, demonstrations: Demonstrations) -> list[bool]:
+        """Return for each source whether it is reproducible; what is not known is not."""
+        return [kept <= self.LIMIT for kept in self.by_source(demonstrations)]
 
     def files(self) -> Files:
         """Return the artifact's content."""

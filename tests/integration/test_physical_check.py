@@ -64,8 +64,9 @@ def test_what_a_run_says_of_it(tmp_path: Path) -> None:
     found = results.reproducibility
     assert found.one_step.shape == found.horizon.shape == (7, 2)
     said = results.summary()["reproducibility"]
-    assert said["sources"]["fast"] < 0.05 < said["sources"]["slow"]
-    assert said["reproducible"] == ["fast"] and said["everything"] is False
+    fast, slow = said["sources"]
+    assert (fast["name"], slow["name"]) == ("fast", "slow") and fast["distance"] < 0.05 < slow["distance"]
+    assert (fast["reproducible"], slow["reproducible"], said["everything"]) == (True, False, False)
     assert results.env_steps()["reproducibility"] == found.env_steps > 0
 
 

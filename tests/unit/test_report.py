@@ -19,7 +19,7 @@ from oodil.pipeline.environments.driving_world import layout
 from oodil.pipeline.errors import StorageError
 from oodil.pipeline.loading import parse_config
 from oodil.pipeline.metrics import Metrics
-from oodil.pipeline.report import Report, context, looks, paths, summary, write_report
+from oodil.pipeline.report import Report, context, formats, looks, paths, summary, write_report
 from oodil.pipeline.report.looks import contrast, source_looks
 from oodil.pipeline.report.sources import Source, Sources, ranks_demonstrations
 from oodil.pipeline.report.summary import Findings
@@ -666,3 +666,24 @@ def test_a_picture_of_paths_follows_the_weights_and_nothing_else() -> None:
     assert paths.SHADES(0.0)[:3] > paths.SHADES(0.5)[:3] > paths.SHADES(1.0)[:3]
     drawn = paths.sheet(held, {"first rule": np.array([0.9, 0.1]), "second rule": np.ones(2)}, world)
     assert "first rule" in drawn and "second rule" in drawn and drawn.count("<image") == 2
+
+
+@pytest.mark.parametrize(
+    ("written", "expected"),
+    [
+        (formats.spread(368.4, -84.9), "368"),
+        (formats.spread(9.94, 1.0), "9.9"),
+        (formats.spread(0.0123, 0.5), "0.012"),
+        (formats.spread(1234.5, 3000.0), "1,234"),
+        (formats.spread(float("nan"), 1.0), formats.UNKNOWN),
+        (formats.count(999_499), f"999{formats.SPACE}k"),
+        (formats.count(999_500), f"1{formats.SPACE}M"),
+        (formats.count(5_322_950), f"5.32{formats.SPACE}M"),
+        (formats.count(12), "12"),
+        (formats.percent(0.004), f"0.4{formats.SPACE}%"),
+        (formats.percent(1.0), f"100{formats.SPACE}%"),
+        (formats.duration(59.6), f"1{formats.SPACE}min 00{formats.SPACE}s"),
+    ],
+)
+def test_how_numbers_are_written(written: str, expected: str) -> None:
+    assert written == expected

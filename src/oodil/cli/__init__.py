@@ -74,7 +74,7 @@ for _command in (
 ):
     app.command()(_command)
 
-demos_app = typer.Typer(help="Inspect and collect demonstrations.", no_args_is_help=True)
+demos_app = typer.Typer(help="Look at demonstrations, collect, convert and export them.", no_args_is_help=True)
 demos_app.command("inspect")(demonstrations.inspect_demos)
 demos_app.command("collect")(demonstrations.collect_demos)
 demos_app.command("convert")(demonstrations.convert_demos)

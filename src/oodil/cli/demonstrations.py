@@ -48,10 +48,12 @@ def collect_demos(
     from oodil.orchestrator import check_inputs, choose, open_run
     from oodil.pipeline.artifacts import write_file
     from oodil.pipeline.datasets import encode_demonstrations
+    from oodil.pipeline.datasets.foreign import check_output
     from oodil.pipeline.loading import load_config
     from oodil.pipeline.stages.demonstrations import load_demonstrations
     from oodil.pipeline.stages.experts import ExpertsStage
 
+    check_output(output, ())
     config = load_config(config_source, overrides)
     experts = ExpertsStage()
     if train:

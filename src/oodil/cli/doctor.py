@@ -102,8 +102,8 @@ def _rate() -> Iterator[Finding]:
     from oodil.estimate import REFERENCE_STEPS_PER_S, hopper_seconds
 
     rate = 1 / hopper_seconds()
-    found = f"{rate:,.0f} steps/s of Hopper on one core ({REFERENCE_STEPS_PER_S:,} where the documents' times are from)"
-    slow = f"runs take {REFERENCE_STEPS_PER_S / rate:.0f} times as long as in the documents"
+    found = f"{rate:,.0f} steps/s of Hopper on one core; a fast machine takes {REFERENCE_STEPS_PER_S:,}"
+    slow = f"runs take about {REFERENCE_STEPS_PER_S / rate:.1f} times as long as there"
     yield Finding("simulator", found, slow if rate < REFERENCE_STEPS_PER_S / 2 else "")
 
 

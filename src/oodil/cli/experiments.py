@@ -108,7 +108,8 @@ def _print_plan(made: "Table", selected: "dict[str, list[Stage]]", workers: int)
         for kind in zip(*((each.own, each.shared, each.finished) for each in found), strict=True)
     )
     console.print(
-        f"{len(found)} runs: {own} stages to compute, {shared} to take over, {done} finished",
+        f"{len(found)} run{'' if len(found) == 1 else 's'}: {own} stages to compute, {shared} to take over, "
+        f"{done} finished",
         highlight=False,
         soft_wrap=True,
     )

@@ -61,10 +61,7 @@ def export_policy(
     from oodil.api import open_run
 
     results = open_run(run_dir)
-    known = [each.name for each in results.policies]
-    name = policy or known[0]
-    if name not in known:
-        raise ConfigError(f"{run_dir}: no policy {name!r}; this run has {', '.join(known)}")
+    name = policy or results.policies[0].name
     trained = results.policy(name)
     try:
         from oodil.pipeline.onnx_export import write_onnx

@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from itertools import takewhile
 from pathlib import Path
 from typing import Annotated
 
@@ -87,8 +88,13 @@ def configs(
         print(f"{copy}: try `oodil run {copy}/quickstart.yaml`")
         return
     for name, path in shipped_configs().items():
-        first = path.read_text().splitlines()[0]
-        print(f"{name:<24} {first.removeprefix('# ') if first.startswith('# ') else ''}")
+        print(f"{name:<24} {_first_sentence(path.read_text())}")
+
+
+def _first_sentence(text: str) -> str:
+    """Return the first sentence of the comment that a file begins with."""
+    comment = takewhile(lambda line: line.startswith("#"), text.splitlines())
+    return " ".join(line.removeprefix("# ") for line in comment).partition(". ")[0].rstrip(".")
 
 
 def status(run_dir: RunPath, as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False) -> None:

@@ -51,7 +51,7 @@ def _summary_rows(results: RunResults) -> Iterator[tuple[str, str]]:
             shares = f"{figures['share_before']:.3f} -> {figures['share']:.3f}"
             yield f"transferable share of the sampling mass, {weighting.title}", shares
     if "reproducibility" in found:
-        sources = found["reproducibility"]["reproducible"]
+        sources = [each["name"] for each in found["reproducibility"]["sources"] if each["reproducible"]]
         everything = "everything" if found["reproducibility"]["everything"] else ", ".join(sources) or "nothing"
         yield "the imitator's simulator can follow", everything
     if "env_steps" in found:
