@@ -22,6 +22,7 @@ from oodil.bench import random_demonstrations
 from oodil.pipeline.algorithms.gail import AdversarialReward, imitator
 from oodil.pipeline.algorithms.learner import Learner
 from oodil.pipeline.collecting import collect
+from oodil.pipeline.config import EnvironmentConfig
 from oodil.pipeline.data import TransitionBatch, Unit, UnitResult
 from oodil.pipeline.environments import environment_spec
 from oodil.pipeline.seeding import derive_key
@@ -39,7 +40,7 @@ COLLECTED = 12
 def learner_for(env_id: str) -> Learner[AdversarialReward]:
     """Return a learner with the default settings."""
     gail = run_config(env_id, 1).imitation.gail
-    demonstrations = random_demonstrations(env_id)
+    demonstrations = random_demonstrations(EnvironmentConfig(id=env_id))
     spec, weights = environment_spec(env_id, {}), np.ones(len(demonstrations))
     return imitator(spec.observation_dim, spec.action_dim, spec.max_episode_steps, demonstrations, weights, gail, 0)
 

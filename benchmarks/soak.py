@@ -53,7 +53,10 @@ def main() -> None:
         command += ["--workers", "2"]
         command += ["evaluation.num_points=1000", "--run-dir", str(Path(folder) / "run")]
         run = psutil.Popen(command, stdout=subprocess.DEVNULL)
-        while not (Path(folder) / "run" / "logs" / "imitation-imitation.1.log").exists():
+        logs = Path(folder) / "run" / "logs"
+        while not any(logs.glob("imitation-training-1.*.log")):
+            if run.poll() is not None:
+                raise SystemExit(f"the run ended by itself: exit code {run.poll()}")
             time.sleep(1)
         started = time.monotonic()
         while (minute := (time.monotonic() - started) / 60) < arguments.minutes:

@@ -7,7 +7,7 @@ Run ``python docs/make_results.py``.
 """
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from measured import EXPERIMENTS, alone, choice, controls, later, later_curves, paths, speed
@@ -93,7 +93,7 @@ def summary(held: dict[str, Table]) -> Iterator[str]:
 def readme(text: str, folder: Path = EXPERIMENTS) -> str:
     """Return the README with the committed results in it, or as it is while there are none.
 
-    It has the rows in which ours and naive GAIL have enough seeds to be compared.
+    It has the rows in which ours has enough seeds; naive GAIL's figure is beside it where it has as many.
     """
     rows = []
     for table in tables(folder).values():
@@ -101,14 +101,15 @@ def readme(text: str, folder: Path = EXPERIMENTS) -> str:
             continue
         where = f"[{table.records.caption.partition(',')[0]}](docs/results.md#{anchor(table)})"
         for row in table.records.rows:
-            each = [table.entries[row, method] for method in (table.ours, NAIVE)]
-            if any(len(entry.by_seed) < ENOUGH_SEEDS for entry in each):
+            ours, naive = (table.entries[row, method] for method in (table.ours, NAIVE))
+            if len(ours.by_seed) < ENOUGH_SEEDS:
                 continue
-            best = table.measure.best(*(entry.found.mean for entry in each if entry.found))
+            compared = (ours, naive) if len(naive.by_seed) >= ENOUGH_SEEDS else (ours,)
+            best = table.measure.best(*(entry.found.mean for entry in compared if entry.found))
+            told_of = [cell(table, entry, best) for entry in compared] + [formats.UNKNOWN] * (2 - len(compared))
             shares = [table.by_seed(row, table.ours, figure).values() for figure in ("share_before", "share_after")]
             told = " -> ".join(formats.percent(sum(share) / len(share)) for share in shares if share) or formats.UNKNOWN
-            seeds = str(len(each[0].by_seed))
-            rows.append((f"{where}, {row}", seeds, *(cell(table, entry, best) for entry in each), told))
+            rows.append((f"{where}, {row}", ranges(sorted(ours.by_seed)), *told_of, told))
     if not rows:
         return text
     head = ("environment and row", "seeds", "ours", "naive GAIL", "share before -> after")
@@ -121,6 +122,17 @@ def cell(table: Table, entry: Entry, best: float) -> str:
     shown = mean(table, entry)
     bold = f"**{shown}**" if entry.found and entry.found.mean == best else shown
     return f"{bold} ({over_seeds(table, entry)})"
+
+
+def ranges(seeds: Sequence[int]) -> str:
+    """Return ascending numbers, those that follow one another by the first and the last."""
+    parts: list[list[int]] = []
+    for seed in seeds:
+        if parts and seed == parts[-1][-1] + 1:
+            parts[-1].append(seed)
+        else:
+            parts.append([seed])
+    return ", ".join(str(part[0]) if len(part) == 1 else f"{part[0]} to {part[-1]}" for part in parts)
 
 
 def anchor(table: Table) -> str:

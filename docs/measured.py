@@ -101,7 +101,11 @@ def later() -> str:
     for seed, run in measured["seeds"].items():
         for each in _by_source(run["frozen"]["transferability"]):
             verdicts = (str(each[key]) for key in ("demonstrations", "kept", "open", "unlike"))
-            score = f"{each['score']:.3f} [{each['low']:.3f}, {each['high']:.3f}]" if each["score"] else formats.UNKNOWN
+            score = (
+                f"{each['score']:.3f} [{each['low']:.3f}, {each['high']:.3f}]"
+                if each["score"] is not None
+                else formats.UNKNOWN
+            )
             sources.append((seed, each["name"], *verdicts, score))
     before = ", ".join(f"{run['before']:,.0f}" for run in runs)
     head = ("weighting", "AUROC", "share before → after", "fine-tuned: mean return (seeds)")

@@ -7,6 +7,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"
 
 from collections.abc import Callable  # noqa: E402
+from pathlib import Path  # noqa: E402
 
 import hypothesis  # noqa: E402
 import numpy as np  # noqa: E402
@@ -31,7 +32,7 @@ Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests of whole runs and real processes are slow; among the others, the slow ones say so themselves."""
     for item in items:
-        if {"integration", "fault"} & set(item.path.parts):
+        if {"integration", "fault"} & set(item.path.relative_to(Path(__file__).parent).parts):
             item.add_marker(pytest.mark.slow)
 
 

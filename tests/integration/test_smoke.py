@@ -70,8 +70,10 @@ def test_a_wheel_holds_oodil_alone(wheel: Path) -> None:
     assert {name.split("/")[0].split("-")[0] for name in names} == {"oodil"}
     for needed in ("py.typed", "configs/hopper.yaml", "configs/experts/hopper-gravity-9.8/policy.safetensors"):
         assert f"oodil/{needed}" in names
-    tracked = subprocess.run(["git", "ls-files", "pipeline", "workers"], cwd=ROOT, capture_output=True, text=True)
-    missing = [name for name in tracked.stdout.split() if f"oodil/{name}" not in names]
+    listing = ["git", "ls-files", "pipeline", "workers"]
+    tracked = subprocess.run(listing, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
+    assert "pipeline/stage.py" in tracked
+    missing = [name for name in tracked if f"oodil/{name}" not in names]
     assert not missing, missing
 
 

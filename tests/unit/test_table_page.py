@@ -320,8 +320,9 @@ def test_the_results_in_the_docs_are_those_that_are_committed():
     """If this fails, run ``python docs/make_results.py``."""
     script = runpy.run_path(str(ROOT / "docs" / "make_results.py"))
     assert (ROOT / "docs" / "results.md").read_text(encoding="utf-8") == script["page"]()
-    drawn = {path.name for path in (ROOT / "docs" / "results").glob("*")}
-    assert drawn == set(re.findall(r"\(results/([^)]+)\)", script["page"]()))
+    drawn = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "docs" / "results").glob("*")}
+    assert drawn.keys() == set(re.findall(r"\(results/([^)]+)\)", script["page"]()))
+    assert drawn == {name: f"{svg}\n" for name, svg in script["figures"]().items()}
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert readme == script["readme"](readme)
 
@@ -333,12 +334,17 @@ def test_the_readme_has_the_rows_with_enough_seeds(folder: Path):
     assert made.startswith(f"above{script['BEGINNING']}") and made.endswith(f"{script['END']}below")
     (row,) = [line for line in made.splitlines() if "made-up" in line]
     assert row.startswith(
-        "| [A fixture of the tests: nobody measured these figures.](docs/results.md#made-up), 1:1 | 5 | "
+        "| [A fixture of the tests: nobody measured these figures.](docs/results.md#made-up), 1:1 | 20 to 24 | "
     )
     assert "**300** (IQM 300 (167 to 467)) | 210 (IQM 217 (117 to 317)) |" in row
     assert row.endswith("| 10 % -> 75 % |") and "old" not in made
     assert script["readme"](made, folder.parent) == made
     assert script["readme"](text, folder / "empty") == text
+
+
+def test_ranges_of_seeds():
+    ranges = runpy.run_path(str(ROOT / "docs" / "make_results.py"))["ranges"]
+    assert [ranges(seeds) for seeds in ([20, 21, 22], [3], [0, 1, 4, 7, 8])] == ["20 to 22", "3", "0 to 1, 4, 7 to 8"]
 
 
 def test_the_results_page_says_what_is_better_than_the_paper_and_what_is_not(folder: Path):
