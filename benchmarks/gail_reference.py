@@ -162,12 +162,15 @@ def run_seed(name: str, dynamics: str, seed: int, config: GailConfig, keep: Path
 
 
 def finished(path: Path | None, asked: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the results that a file has from an interrupted call with the same settings and libraries."""
+    """Return the results that a file has from earlier calls; one of other settings or libraries is refused."""
     if path is None or not path.exists():
         return []
     found: dict[str, Any] = json.loads(path.read_text())
-    same = all(found[key] == asked[key] for key in ("dynamics", "set", "versions"))
-    return found["seeds"] if same else []
+    for key in ("dynamics", "set", "versions"):
+        if found[key] != asked[key]:
+            raise SystemExit(f"{path}: was made with {key} {found[key]}, not {asked[key]}; choose another file")
+    seeds: list[dict[str, Any]] = found["seeds"]
+    return seeds
 
 
 def main() -> None:
@@ -193,7 +196,7 @@ def main() -> None:
         jobs += [(name, arguments.dynamics, seed, config, arguments.keep) for seed in left]
     with ProcessPoolExecutor(arguments.processes, mp_context=multiprocessing.get_context("spawn")) as pool:
         for future in [pool.submit(run_seed, *job) for job in jobs]:
-            results.append(future.result())
+            results.append(future.result() | {"time": found["machine"]["time"]})
             print({name: value for name, value in results[-1].items() if name != "curve"}, flush=True)
             save(arguments.json, found | {"seeds": results})
     for name in arguments.tasks or TASKS:

@@ -55,11 +55,7 @@ class Discriminator(nn.Module):
             mean, scale = standardization(np.concatenate((states, successors - states), axis=1), each)
         self.register_buffer("input_mean", torch.from_numpy(mean))
         self.register_buffer("input_scale", torch.from_numpy(scale))
-        self.restart_optimizer()
-
-    def restart_optimizer(self) -> None:
-        """Reset the optimizer's moments and learning rate."""
-        self.optimizer = Adam(list(self.parameters()), self.config.learning_rate)
+        self.optimizer = Adam(list(self.parameters()), config.learning_rate)
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Return (B,) logits of inputs from `inputs`; high for demonstrations."""

@@ -125,8 +125,9 @@ class Learner(Generic[Reward]):
             entropy: of the new policy, in nats.
             value_loss: mean squared error in the last minibatch.
             improvement, step_fraction: of TRPO alone, see `Trpo.update`.
-            discriminator_loss, discriminator_demonstration_loss, discriminator_policy_loss, demonstration_accuracy,
-            policy_accuracy: of imitators alone, see `Discriminator.update`.
+            discriminator_loss, discriminator_demonstration_loss, discriminator_policy_loss,
+            discriminator_squared_gradient, demonstration_accuracy, policy_accuracy: of imitators alone, see
+            `Discriminator.update`.
         """
         config = self.config
         step_scale = 1 - iteration / config.num_iterations if config.anneal else 1.0

@@ -22,7 +22,7 @@ from oodil.pipeline.policy import LARGEST_INPUT, GaussianPolicy
 class Tanh(torch.autograd.Function):
     """NumPy's tanh, which takes a tenth of the time of torch's; that would be half of a pass through a network.
 
-    It can be differentiated any number of times in reverse mode, and once in forward mode.
+    It can be differentiated any number of times in reverse mode.
     """
 
     @staticmethod
@@ -31,7 +31,6 @@ class Tanh(torch.autograd.Function):
         y = torch.from_numpy(np.tanh(x.detach().numpy()))
         # The output, not the input: the derivative is 1 - y^2, and the graph of a second derivative goes through y.
         ctx.save_for_backward(y)
-        ctx.save_for_forward(y)
         return y
 
     @staticmethod
@@ -39,12 +38,6 @@ class Tanh(torch.autograd.Function):
         """Return the gradient with respect to the input."""
         (y,) = ctx.saved_tensors
         return torch.ops.aten.tanh_backward(gradient, y)
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
-        """Return the change of the output when the input moves along ``tangent``."""
-        (y,) = ctx.saved_tensors
-        return torch.ops.aten.tanh_backward(tangent, y)
 
 
 class MLP(nn.Module):

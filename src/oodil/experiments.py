@@ -64,7 +64,7 @@ class Table:
         """
         own, found = {part for run in self.runs for part in run.parts.values()}, {}
         for file in sorted(self.folder.parent.glob(f"*/*/{self.runner.config.name}")):
-            if file.parents[1].name == self.folder.name:
+            if file.parents[1].name == self.folder.name or file.parent.name == self.runner.path.name:
                 continue
             try:
                 parts = parts_of(read_run(file.parent).config)
