@@ -17,8 +17,11 @@ from threadpoolctl import threadpool_limits
 from oodil.bench import machine
 from oodil.pipeline.artifacts import Checkpoints, encode_json
 from oodil.pipeline.collecting import InlineRollouts, RolloutSource
-from oodil.pipeline.config import RunConfig
+from oodil.pipeline.config import EnvironmentConfig, RunConfig
+from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.loading import parse_config
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.stages.demonstrations import collect_demonstrations
 from oodil.pipeline.versions import library_versions
 from oodil.workers.fork_server import ONE_THREAD
 
@@ -59,6 +62,22 @@ def save(path: Path | None, found: dict[str, Any]) -> None:
         found["machine"]["load_average_after"] = os.getloadavg()
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(encode_json(found, sort_keys=False))
+
+
+def collected(
+    expert: GaussianPolicy | None,
+    environment: EnvironmentConfig,
+    source: int,
+    count: int,
+    seed: int,
+    minimum_return: float | None = None,
+) -> Demonstrations:
+    """Return demonstrations of a source as configurations collect them: whole episodes, or those of a least return."""
+    found, _ = collect_demonstrations(
+        expert, environment, source, count, seed,
+        deterministic=False, full_length_only=minimum_return is None, minimum_return=minimum_return, context=Quiet(),
+    )  # fmt: skip
+    return found
 
 
 class Quiet:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Quiet, arguments_of, circumstances, one_thread, save
+from common import arguments_of, circumstances, collected, one_thread, save
 from gail_reference import EXPERTS
 from numpy.typing import NDArray
 
@@ -23,7 +23,6 @@ from oodil.pipeline.artifacts import write_file
 from oodil.pipeline.config import EnvironmentConfig
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.datasets import encode_demonstrations
-from oodil.pipeline.stages.demonstrations import collect_demonstrations
 from oodil.pipeline.stages.experts import load_expert
 
 OWN, GENUINE = "gravity 12.0 (own)", "gravity 9.8"
@@ -47,15 +46,11 @@ def changes(rng: np.random.Generator) -> dict[str, Callable[[States], States]]:
     }
 
 
-def collected(label: str, count: int, seed: int) -> Demonstrations:
+def demonstrations_of(label: str, count: int, seed: int) -> Demonstrations:
     """Return demonstrations of one of the sources."""
     gravity, _ = SOURCES[label]
     expert, _ = load_expert(EXPERTS / f"hopper-gravity-{gravity}")
-    environment = EnvironmentConfig(id="oodil/Hopper-v0", dynamics={"gravity": gravity})
-    return collect_demonstrations(
-        expert, environment, 0, count, seed,
-        deterministic=False, full_length_only=True, minimum_return=None, context=Quiet(),
-    )[0]  # fmt: skip
+    return collected(expert, EnvironmentConfig(id="oodil/Hopper-v0", dynamics={"gravity": gravity}), 0, count, seed)
 
 
 def changed(shown: Demonstrations, label: str, change: Callable[[States], States]) -> Demonstrations:
@@ -72,7 +67,7 @@ def main() -> None:
     arguments = parser.parse_args()
     seed = arguments.seed
     found: dict[str, Any] = circumstances() | {"raw_hopper_steps_per_s": raw_rate(), "seed": seed, "set": arguments.set}
-    parts = {label: collected(label, count, seed) for label, (_, count) in SOURCES.items()}
+    parts = {label: demonstrations_of(label, count, seed) for label, (_, count) in SOURCES.items()}
     parts["reversed"] = changed(parts[GENUINE], "reversed", lambda states: states[::-1])
     folder = arguments.runs / f"controls-seed{seed}"
     folder.mkdir(parents=True, exist_ok=True)
@@ -97,7 +92,7 @@ def main() -> None:
         print(f"{label}: mean {those.mean():.3f}, {those.min():.3f} to {those.max():.3f}", flush=True)
 
     rng = np.random.default_rng(seed)
-    later = {label: collected(label, FRESH, seed + 1_000) for label in SOURCES}
+    later = {label: demonstrations_of(label, FRESH, seed + 1_000) for label in SOURCES}
     later |= {label: changed(later[GENUINE], label, change) for label, change in changes(rng).items()}
     found["fresh"] = {}
     for label, part in later.items():

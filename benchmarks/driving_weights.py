@@ -21,8 +21,8 @@ import oodil
 from oodil.pipeline.config import EnvironmentConfig
 from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import make_batch
-from oodil.pipeline.environments.driving import STEP_REWARD
 from oodil.pipeline.environments.driving_world import WIDTH, Layout, positions, touches
+from oodil.pipeline.environments.goals import reached_goal
 from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.report.paths import sheet, world_of
 from oodil.pipeline.results import Transferability
@@ -70,7 +70,8 @@ def driven(results: RunResults, policy: str, num_episodes: int) -> dict[str, Any
     returns = np.array([episode.env_return for episode in episodes])
     steps = np.array([len(episode.states) - 1 for episode in episodes])
     third = np.array([(episode.states[0, 0] / 2 + 0.5) * WIDTH // 25 for episode in episodes])
-    reached = returns - STEP_REWARD * steps > 0
+    reached = reached_goal(environment.id, returns, steps, cars.max_episode_steps)
+    assert reached is not None
     by_third = [float(reached[third == i].mean()) for i in range(3)]
     return {"mean_return": float(returns.mean()), "share_reached": float(reached.mean()), "by_third": by_third}
 

@@ -20,7 +20,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from common import UNUSED, Quiet, arguments_of, circumstances, one_thread, save, seeds_of
+from common import UNUSED, Quiet, arguments_of, circumstances, collected, one_thread, save, seeds_of
 from numpy.typing import NDArray
 
 from oodil.pipeline.algorithms.gail import imitator
@@ -32,7 +32,6 @@ from oodil.pipeline.environments import environment_spec
 from oodil.pipeline.evaluation import evaluate
 from oodil.pipeline.loading import apply_override
 from oodil.pipeline.seeding import derive_key
-from oodil.pipeline.stages.demonstrations import collect_demonstrations
 from oodil.pipeline.stages.experts import load_expert
 from oodil.pipeline.training import Probe, train
 
@@ -92,17 +91,9 @@ TASKS = {
 
 def demonstrations_of(task: Task, seed: int) -> Demonstrations:
     """Collect the demonstrations of a task."""
-    return collect_demonstrations(
-        None if task.expert == "hand-written" else load_expert(EXPERTS / task.expert)[0],
-        EnvironmentConfig(id=task.env_id, dynamics={**task.demonstrator}),
-        0,
-        task.count,
-        seed,
-        deterministic=False,
-        full_length_only=task.minimum_return is None,
-        minimum_return=task.minimum_return,
-        context=Quiet(),
-    )[0]
+    expert = None if task.expert == "hand-written" else load_expert(EXPERTS / task.expert)[0]
+    environment = EnvironmentConfig(id=task.env_id, dynamics={**task.demonstrator})
+    return collected(expert, environment, 0, task.count, seed, task.minimum_return)
 
 
 def run_seed(name: str, dynamics: str, seed: int, config: GailConfig, keep: Path | None) -> dict[str, Any]:

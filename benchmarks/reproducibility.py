@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Quiet, arguments_of, circumstances, one_thread, save
+from common import Quiet, arguments_of, circumstances, collected, one_thread, save
 from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 
@@ -22,7 +22,6 @@ from oodil.pipeline.data import Demonstrations
 from oodil.pipeline.environments import make_batch
 from oodil.pipeline.loading import load_config
 from oodil.pipeline.results import Reproducibility
-from oodil.pipeline.stages.demonstrations import collect_demonstrations
 from oodil.pipeline.stages.experts import load_expert
 from oodil.pipeline.stages.reproducibility import follow
 
@@ -36,18 +35,7 @@ def measure(name: str, count: int, section: ReproducibilityConfig) -> dict[str, 
     for i, source in enumerate(sources):
         assert source.expert_folder is not None
         demonstrator = EnvironmentConfig(id=environment.id, dynamics=source.dynamics)
-        part, _ = collect_demonstrations(
-            load_expert(source.expert_folder)[0],
-            demonstrator,
-            i,
-            count,
-            config.seed,
-            deterministic=False,
-            full_length_only=True,
-            minimum_return=None,
-            context=Quiet(),
-        )
-        parts.append(part)
+        parts.append(collected(load_expert(source.expert_folder)[0], demonstrator, i, count, config.seed))
     demonstrations = Demonstrations.joined(parts)
     begun, begun_cpu = time.perf_counter(), time.process_time()
     found = follow(demonstrations, range(len(demonstrations)), environment, section, config.seed, Quiet())

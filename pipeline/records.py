@@ -84,13 +84,14 @@ def _reason(failed: str, run: PlannedRun, method: str) -> str:
 def _cell(results: RunResults, run: PlannedRun, method: str, policy: str) -> dict[str, Any]:
     """Return the figures of a method in a run."""
     final, curve, config = results.evaluation(policy), results.curve(policy), results.config
-    stages = run.stages([method])
-    (weighting,) = [stage.weighting for stage in results.policies if stage.name == policy]
+    (stage,) = [stage for stage in results.policies if stage.name == policy]
+    weighting = stage.weighting
     environment = config.environment
     limit = environment_spec(environment.id, environment.dynamics).max_episode_steps
     reached = reached_goal(environment.id, final.returns, final.lengths, limit)
     separation = results.separation(weighting) if weighting else {}
-    clusters = results.cluster_diagnostics if "clustering" in {stage.name for stage in stages} else None
+    is_clustered = "clustering" in {each.name for each in run.stages([method])}
+    clusters = results.cluster_diagnostics if is_clustered else None
     return {
         "row": run.row,
         "method": method,
@@ -103,7 +104,7 @@ def _cell(results: RunResults, run: PlannedRun, method: str, policy: str) -> dic
         "share_after": separation.get("share"),
         "effective_number": separation.get("effective_number"),
         "distance": results.trainings(policy).trainings[0].distance,
-        "env_steps": sum(stage.env_steps(results.run) for stage in stages),
+        "env_steps": results.env_steps_of(stage),
         "clusters_used": clusters and clusters.non_empty_clusters,
         "purity": clusters and clusters.purity,
         "curve": {"env_steps": curve.env_steps.tolist(), "mean_return": curve.mean_return.tolist()},

@@ -202,6 +202,15 @@ class RunResults:
         steps = {stage.name: stage.env_steps(self.run) for stage in finished}
         return {name: count for name, count in steps.items() if count}
 
+    def env_steps_of(self, policy: PolicyStage) -> int:
+        """Return the environment steps of a finished policy and of all that it follows from."""
+        needed, taken = {policy.name}, 0
+        for stage in reversed(stages(self.config)):
+            if stage.name in needed:
+                needed.update(stage.inputs)
+                taken += stage.env_steps(self.run)
+        return taken
+
     def seconds(self) -> dict[str, float]:
         """Return how long each finished stage took, with what was spent on it before an interruption.
 

@@ -203,12 +203,11 @@ def notes(found: Findings) -> list[Note]:
     if len(set(env_steps.values())) > 1:
         named = ", ".join(f"{found.title(name)} {formats.count(steps)}" for name, steps in env_steps.items())
         told.append(Note(f"The policies were trained for different numbers of environment steps ({named})."))
-    if "imitation" in found.finals and len(found.finals) > 1 and results.config.imitation.warm_start:
-        steps = results.env_steps()
-        ours = sum(steps.get(name, 0) for name in ("imitators", "transferability", "imitation"))
+    ours = results.policies[0]
+    if len(found.finals) > 1 and ours.name in found.finals and ours.is_warm_started(results.config):
         text = (
             "Our policy goes on from the imitator of a cluster, where the others begin anew. With all imitators and "
-            f"the readings of their scores, ours took {formats.count(ours)} environment steps."
+            f"the readings of their scores, ours took {formats.count(results.env_steps_of(ours))} environment steps."
         )
         told.append(Note(text))
     if found.sources and not found.sources.fully_marked:

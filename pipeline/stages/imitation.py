@@ -26,7 +26,7 @@ class ImitationStage(PolicyStage):
 
     def check(self, config: RunConfig) -> None:
         """Refuse networks of other widths than those that are continued."""
-        if config.imitation.warm_start:
+        if self.is_warm_started(config):
             name = "transferability.gail, which it goes on from unless imitation.warm_start is false,"
             refuse_other_widths(name, config.transferability.gail, config.imitation.gail)
 
@@ -37,11 +37,17 @@ class ImitationStage(PolicyStage):
     def gail(self, config: RunConfig) -> GailConfig:
         """Return how each training is done: with less noise at first, if it is no beginner's."""
         gail = config.imitation.gail
-        return gail.model_copy(update={"initial_log_std": log(gail.least_std)}) if config.imitation.warm_start else gail
+        if self.is_warm_started(config):
+            return gail.model_copy(update={"initial_log_std": log(gail.least_std)})
+        return gail
+
+    def is_warm_started(self, config: RunConfig) -> bool:
+        """Return whether it goes on from an imitator."""
+        return config.imitation.warm_start
 
     def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> bool:
         """Take over policy and value function of the cluster of which most transitions are drawn."""
-        if not run.config.imitation.warm_start:
+        if not self.is_warm_started(run.config):
             return False
         found = Transferability.load(run.artifact(TransferabilityStage.name))
         drawn = np.bincount(found.clusters, found.weights * (self.demonstrations(run).lengths - 1))

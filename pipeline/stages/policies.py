@@ -63,6 +63,10 @@ class PolicyStage(Stage):
         """Bring a new learner to where its training begins; return whether it acts as somebody has trained it to."""
         return False
 
+    def is_warm_started(self, config: RunConfig) -> bool:
+        """Return whether it goes on from what an earlier stage of the run has trained."""
+        return False
+
     def jobs(self, run: Run) -> list[str]:
         """Return the trainings."""
         return [f"training-{n}" for n in range(1, run.config.imitation.num_trainings + 1)]

@@ -271,3 +271,19 @@ def test_a_damaged_artifact_is_one_message(tmp_path: Path) -> None:
     assert "demonstrations is damaged" in refused("demos", "inspect", str(run_dir))
     (run_dir / "config.json").write_text("{")
     assert "config.json: cannot be read" in refused("status", str(run_dir))
+
+
+def test_demonstrations_are_collected_into_a_file_and_not_twice(tmp_path: Path) -> None:
+    output = tmp_path / "both.safetensors"
+    words = ["demos", "collect", str(MICRO), "--output", str(output), "--workers", "0"]
+    first = CliRunner().invoke(app, words)
+    assert first.exit_code == 0 and "7 demonstrations" in first.output, first.output
+    content, events = output.read_bytes(), tmp_path / f".{output.name}.run" / "events.jsonl"
+    output.unlink()
+    again = CliRunner().invoke(app, words)
+    assert again.exit_code == 0 and output.read_bytes() == content
+    assert events.read_text().count('"stage_finished"') == 1, "what is collected is reused"
+    other = CliRunner().invoke(app, [*words, "demonstrations.sources.0.count=2"])
+    assert other.exit_code == 0 and "6 demonstrations" in other.output, other.output
+    held, environment = oodil.read_demonstrations(output)
+    assert (len(held), held.source_labels, environment) == (6, ("fast", "slow"), "oodil/Hopper-v0")

@@ -429,6 +429,18 @@ def test_weak_evaluations_are_called_weak(tmp_path: Path) -> None:
     assert "(ours 5 M, naive GAIL 1 M, oracle 5 M)" in notes(run)
 
 
+def test_what_ours_begins_with_and_takes_in_all_is_said(tmp_path: Path) -> None:
+    run = full_run(tmp_path, **SMALL)
+    results = RunResults(run)
+    ours, naive = results.policies[:2]
+    steps = results.env_steps()
+    # Of the imitators, the readings, and the policy.
+    assert results.env_steps_of(ours) == 5 * 1_500_000 + 20_000 + steps["imitation"]
+    assert results.env_steps_of(naive) == steps["naive_gail"]
+    assert "goes on from the imitator of a cluster" in notes(run) and "ours took 17.5 M environment steps" in notes(run)
+    assert not naive.is_warm_started(run.config)
+
+
 def test_returns_may_be_unknown_negative_or_without_a_curve(tmp_path: Path) -> None:
     run = full_run(tmp_path, **SMALL)
     writer = Writer(run, 2)
