@@ -52,7 +52,7 @@ class Candidates:
 
     def _measure(self) -> NDArray[np.float64]:
         """Return (2 + P,) the distance of the networks as they are, the steps that it took, and their parameters."""
-        learner, episodes = self._learner, CANDIDATE_EPISODES
-        key = derive_key(learner.root_seed, NAME)
-        measured = distance_of(learner.behavior_policy(), learner.reward_model, self._environment, episodes, key)
+        learner, environment = self._learner, self._environment
+        policy, key = learner.behavior_policy(), derive_key(learner.root_seed, NAME)
+        measured = distance_of(policy, learner.reward_model, environment, CANDIDATE_EPISODES, key)
         return np.append(measured, parameters_to_vector(self._networks.parameters()).detach().numpy())

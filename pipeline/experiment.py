@@ -19,7 +19,7 @@ from oodil.pipeline.config.sections import Section
 from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.loading import find_config, find_file, load_config, read_yaml, shipped_experiments, validated
 from oodil.pipeline.stage import Stage
-from oodil.pipeline.stages import policies_of, stages
+from oodil.pipeline.stages import needed_for, policies_of, stages
 
 
 def parse_seeds(value: Any) -> Any:
@@ -158,12 +158,7 @@ class PlannedRun:
 
     def stages(self, methods: Collection[str]) -> list[Stage]:
         """Return the stages that some of its methods need, each after those it reads from."""
-        every = stages(self.config)
-        needed = {policy for method, policy in self.methods.items() if method in methods}
-        for stage in reversed(every):
-            if stage.name in needed:
-                needed.update(stage.inputs)
-        return [stage for stage in every if stage.name in needed]
+        return needed_for(self.config, {policy for method, policy in self.methods.items() if method in methods})
 
 
 def parts_of(config: RunConfig) -> dict[str, str]:

@@ -29,7 +29,7 @@ from oodil.pipeline.results import (
     Transferability,
 )
 from oodil.pipeline.stage import Run, StageState, state_of
-from oodil.pipeline.stages import PolicyStage, Weighting, policies_of, stages, weightings_of
+from oodil.pipeline.stages import PolicyStage, Weighting, needed_for, policies_of, stages, weightings_of
 from oodil.pipeline.stages.demonstrations import load_demonstrations, transferable_marks
 from oodil.pipeline.suggestion import Suggestion, suggest
 from oodil.pipeline.verdicts import VerdictTable
@@ -204,12 +204,7 @@ class RunResults:
 
     def env_steps_of(self, policy: PolicyStage) -> int:
         """Return the environment steps of a finished policy and of all that it follows from."""
-        needed, taken = {policy.name}, 0
-        for stage in reversed(stages(self.config)):
-            if stage.name in needed:
-                needed.update(stage.inputs)
-                taken += stage.env_steps(self.run)
-        return taken
+        return sum(stage.env_steps(self.run) for stage in needed_for(self.config, [policy.name]))
 
     def seconds(self) -> dict[str, float]:
         """Return how long each finished stage took, with what was spent on it before an interruption.

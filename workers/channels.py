@@ -214,13 +214,8 @@ def new_key_pair() -> KeyPair:
 
 def check_address(address: str) -> None:
     """Raise AddressError for an address that no worker can connect to, whether or not a learner is there."""
-    context = zmq.Context()
-    try:
-        context.socket(zmq.DEALER).connect(address)
-    except zmq.ZMQError as error:
-        raise AddressError(f"cannot connect to {address!r}: {error.strerror}; expected tcp://HOST:PORT") from error
-    finally:
-        context.destroy(linger=0)
+    with _trial(zmq.DEALER, f"connect to {address!r}, which is no tcp://HOST:PORT") as socket:
+        socket.connect(address)
 
 
 def open_access(address: str | None, keys: Path | None) -> Access | None:
@@ -233,14 +228,21 @@ def open_access(address: str | None, keys: Path | None) -> Access | None:
     if address is None or keys is None:
         raise KeysError("--bind and --keys belong together: nobody joins a run without a key (`oodil keys new`)")
     server_keys(keys)
+    with _trial(zmq.ROUTER, f"listen on {address}") as socket:
+        socket.bind(address)
+    return Access(address, keys)
+
+
+@contextmanager
+def _trial(kind: int, what: str) -> Iterator[zmq.Socket[bytes]]:
+    """Open a socket to see whether an address can be used, and close it again. Raises AddressError if it cannot."""
     context = zmq.Context()
     try:
-        context.socket(zmq.ROUTER).bind(address)
+        yield context.socket(kind)
     except zmq.ZMQError as error:
-        raise AddressError(f"cannot listen on {address}: {error.strerror}") from error
+        raise AddressError(f"cannot {what}: {error.strerror}") from error
     finally:
         context.destroy(linger=0)
-    return Access(address, keys)
 
 
 def _authenticator(context: zmq.Context, keys: Path) -> ThreadAuthenticator:

@@ -5,6 +5,7 @@ starting one, does not wait for torch.
 """
 
 import importlib
+from collections.abc import Collection
 
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.errors import ConfigError
@@ -39,6 +40,7 @@ __all__ = [
     "imitators",
     "inverse_dynamics",
     "marks",
+    "needed_for",
     "oracle_target",
     "policies",
     "policies_of",
@@ -76,6 +78,15 @@ def stages(config: RunConfig) -> list[Stage]:
             raise ConfigError(f"baselines: no policy {name!r}; there are {', '.join(sorted(known))}")
         add(name)
     return list(found.values())
+
+
+def needed_for(config: RunConfig, names: Collection[str]) -> list[Stage]:
+    """Return the stages of a run with these names and all that they follow from, each after those it reads from."""
+    every, needed = stages(config), set(names)
+    for stage in reversed(every):
+        if stage.name in needed:
+            needed.update(stage.inputs)
+    return [stage for stage in every if stage.name in needed]
 
 
 def policies_of(config: RunConfig) -> list[PolicyStage]:

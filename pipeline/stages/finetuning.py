@@ -93,11 +93,14 @@ class FinetuningStage(PolicyStage):
         steps = section.total_steps or max(1, gail.total_steps // SHARE_OF_STEPS)
         return gail.model_copy(update={"total_steps": steps, "initial_log_std": log(section.initial_std)})
 
-    def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> bool:
+    def is_warm_started(self, config: RunConfig) -> bool:
+        """It is, always."""
+        return True
+
+    def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> None:
         """Take over policy and value function."""
         trained = _policy(run.config)
         learner.continue_from(Policy.load(trained).gaussian, load_value(trained))
-        return True
 
 
 def _base(config: RunConfig) -> Run:

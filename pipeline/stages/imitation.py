@@ -45,15 +45,12 @@ class ImitationStage(PolicyStage):
         """Return whether it goes on from an imitator."""
         return config.imitation.warm_start
 
-    def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> bool:
+    def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> None:
         """Take over policy and value function of the cluster of which most transitions are drawn."""
-        if not self.is_warm_started(run.config):
-            return False
         found = Transferability.load(run.artifact(TransferabilityStage.name))
         drawn = np.bincount(found.clusters, found.weights * (self.demonstrations(run).lengths - 1))
         imitator = Imitator.load(run.job_artifact(ImitatorsStage.name, found.read_from[int(drawn.argmax())]))
         learner.continue_from(imitator.policy, imitator.value)
-        return True
 
 
 register(ImitationStage())

@@ -59,13 +59,12 @@ class PolicyStage(Stage):
         """Return how each training is done."""
         return config.imitation.gail
 
-    def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> bool:
-        """Bring a new learner to where its training begins; return whether it acts as somebody has trained it to."""
+    def is_warm_started(self, config: RunConfig) -> bool:
+        """Return whether its trainings `begin` with something that has been trained before."""
         return False
 
-    def is_warm_started(self, config: RunConfig) -> bool:
-        """Return whether it goes on from what an earlier stage of the run has trained."""
-        return False
+    def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> None:
+        """Bring a new learner to where its training begins, if that is warm started."""
 
     def jobs(self, run: Run) -> list[str]:
         """Return the trainings."""
@@ -118,7 +117,10 @@ class PolicyStage(Stage):
             seen = evaluate(policy, environment.id, environment.dynamics, evaluation.episodes, key)
             return np.array([seen.mean_return, seen.std_return, seen.mean_length])
 
-        known = [curve_point()] if self.begin(run, learner) and evaluation.num_points else []
+        known = []
+        if self.is_warm_started(config):
+            self.begin(run, learner)
+            known = [curve_point()] if evaluation.num_points else []
         candidates = Candidates(learner, environment, config.imitation.num_candidates)
         probes = [Probe("curve", evaluation.num_points, curve_point), candidates.probe]
         history = train(learner, environment, gail, probes, context, self.checkpoints(run, job))
