@@ -17,7 +17,7 @@ from oodil.pipeline.algorithms.weights import effective_number, sampling_mass
 from oodil.pipeline.artifacts import Artifact
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.errors import ConfigError, NotFinishedError
+from oodil.pipeline.errors import ConfigError, DataError, NotFinishedError
 from oodil.pipeline.results import (
     Assignment,
     ClusterDiagnostics,
@@ -157,8 +157,15 @@ class RunResults:
         if weighting not in known:
             raise ConfigError(f"{self.path}: no weighting {weighting!r}; this run has {', '.join(known)}")
         self.artifact(weighting)
+        self.refuse_other_states(demonstrations, "demonstrations")
         stage = next(each for each in self.weightings if each.name == weighting)
         return stage.score(self.run, demonstrations)
+
+    def refuse_other_states(self, demonstrations: Demonstrations, origin: str) -> None:
+        """Raise DataError, naming where they are from, for states of another dimension than those of the run."""
+        dim, expected = demonstrations.observation_dim, self.demonstrations.observation_dim
+        if dim != expected:
+            raise DataError(f"{origin}: states have {dim} dimensions; those of {self.path} have {expected}")
 
     def table(self, weighting: str = "transferability") -> list[dict[str, Any]]:
         """Return one row a demonstration: number, source, states, cluster, transferability and weight."""

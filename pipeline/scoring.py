@@ -9,7 +9,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.errors import DataError, NotFinishedError
+from oodil.pipeline.errors import NotFinishedError
 from oodil.pipeline.results import Transferability
 from oodil.pipeline.runs import RunResults
 from oodil.pipeline.stages.weighting import CannotScoreError
@@ -43,7 +43,6 @@ def score(results: RunResults, demonstrations: Demonstrations, weighting: str | 
     Raises DataError for states of another dimension, and the reason if no weighting can score them: CannotScoreError,
     NotFinishedError, or ConfigError for one that the run does not have.
     """
-    check_dimension(results, demonstrations, "demonstrations")
     if weighting is not None:
         return Scored(demonstrations, {weighting: results.score(demonstrations, weighting)}, {})
     found: dict[str, Transferability] = {}
@@ -56,10 +55,3 @@ def score(results: RunResults, demonstrations: Demonstrations, weighting: str | 
     if not found:
         raise next(iter(refused.values()))
     return Scored(demonstrations, found, {name: str(error) for name, error in refused.items()})
-
-
-def check_dimension(results: RunResults, demonstrations: Demonstrations, origin: str) -> None:
-    """Raise DataError, naming where they are from, for states of another dimension than those of the run."""
-    dim, expected = demonstrations.observation_dim, results.demonstrations.observation_dim
-    if dim != expected:
-        raise DataError(f"{origin}: states have {dim} dimensions; those of {results.path} have {expected}")

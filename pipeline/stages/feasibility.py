@@ -24,7 +24,7 @@ from oodil.pipeline.seeding import derive_key, torch_seed
 from oodil.pipeline.stage import Cost, JobContext, Run, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 from oodil.pipeline.stages.policies import PolicyStage
-from oodil.pipeline.stages.weighting import CannotScoreError, Weighting, refuse_other_states
+from oodil.pipeline.stages.weighting import CannotScoreError, Weighting
 
 SIMULATORS = 32
 """Demonstrations that a trained policy tracks side by side."""
@@ -102,11 +102,7 @@ class FeasibilityWeighting(Weighting):
         return _weighted(found, scale, env_steps).files() | scale.files()
 
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
-        """Return the feasibility of other demonstrations by the run's policy, nearest distance and alpha.
-
-        Raises DataError when the states have another dimension than those of the run.
-        """
-        refuse_other_states(run, demonstrations)
+        """Return the feasibility of other demonstrations by the run's policy, nearest distance and alpha."""
         known = load_demonstrations(run)
         policy = Tracker.load(run.job_artifact(self.name, "shared")).policy
         found = _distances(run.config, policy, demonstrations, _scale(run.config, known))

@@ -26,7 +26,7 @@ from oodil.pipeline.seeding import derive_key, torch_seed
 from oodil.pipeline.stage import Cost, JobContext, JobStoppedError, Run, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 from oodil.pipeline.stages.reproducibility import ReproducibilityStage, follow, section_of
-from oodil.pipeline.stages.weighting import Weighting, refuse_other_states
+from oodil.pipeline.stages.weighting import Weighting
 
 if TYPE_CHECKING:
     from oodil.pipeline.algorithms.inverse_dynamics import Exploration, InverseModel
@@ -102,11 +102,7 @@ class InverseDynamics(Weighting):
         return judged(found, own, steps + int((both.lengths - 1).sum())).files() | found.files()
 
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
-        """Follow other demonstrations with the run's model, and judge them by the run's bounds.
-
-        Raises DataError when the states have another dimension than those of the run.
-        """
-        refuse_other_states(run, demonstrations)
+        """Follow other demonstrations with the run's model, and judge them by the run's bounds."""
         found, model = Following.load(run.artifact(self.name)), self._model(run.config)
         model.load(found.model)
         errors = _follower(run.config, model).errors(demonstrations)
@@ -203,11 +199,7 @@ class ExactInverseDynamics(Weighting):
         return judged(found, errors).files() | found.files()
 
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
-        """Follow other demonstrations, in the units of the run's own, and judge them by the run's bounds.
-
-        Raises DataError when the states have another dimension than those of the run.
-        """
-        refuse_other_states(run, demonstrations)
+        """Follow other demonstrations, in the units of the run's own, and judge them by the run's bounds."""
         config, known = run.config, load_demonstrations(run)
         chosen, section = range(len(demonstrations)), section_of(config)
         seen = follow(demonstrations, chosen, config.environment, section, config.seed, measure=known)

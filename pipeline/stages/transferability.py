@@ -130,8 +130,6 @@ class TransferabilityStage(Weighting):
         """Return scores by the frozen clusters and readers, and weights among these demonstrations.
 
         One that is unlike all members of its cluster (`Neighborhood`) gets no score.
-
-        Raises DataError when the states have another dimension than those of the run.
         """
         from oodil.pipeline.algorithms.clustering import ClusterModel
         from oodil.pipeline.algorithms.novelty import Neighborhood

@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from oodil.pipeline.algorithms.weights import kept_weights
 from oodil.pipeline.config import RunConfig
 from oodil.pipeline.data import Demonstrations
-from oodil.pipeline.errors import DataError, OodilError
+from oodil.pipeline.errors import OodilError
 from oodil.pipeline.results import Transferability
 from oodil.pipeline.stage import Run, Stage
-from oodil.pipeline.stages.demonstrations import load_demonstrations
 
 
 class Weighting(Stage):
@@ -41,16 +40,10 @@ class Weighting(Stage):
     def score(self, run: Run, demonstrations: Demonstrations) -> Transferability:
         """Return what it says of other demonstrations, from its finished artifact alone: nothing is trained.
 
+        Their states have as many dimensions as those of the run (`RunResults.score` refuses others).
         Raises `CannotScoreError` for a weighting that knows nothing of demonstrations it was not made with.
         """
 
 
 class CannotScoreError(OodilError):
     """A weighting that cannot score demonstrations which were not part of its run."""
-
-
-def refuse_other_states(run: Run, demonstrations: Demonstrations) -> None:
-    """Raise DataError for demonstrations whose states have another dimension than those of the run."""
-    dim, expected = demonstrations.observation_dim, load_demonstrations(run).observation_dim
-    if dim != expected:
-        raise DataError(f"the states have {dim} dimensions; those of the run have {expected}")

@@ -17,7 +17,7 @@ from oodil.pipeline.evaluation import evaluate as evaluate_policy
 from oodil.pipeline.loading import load_config
 from oodil.pipeline.results import Evaluation, Policy
 from oodil.pipeline.runs import RunResults
-from oodil.pipeline.scoring import Scored, check_dimension
+from oodil.pipeline.scoring import Scored
 from oodil.pipeline.scoring import score as score_by
 from oodil.pipeline.seeding import derive_key
 from oodil.workers.engine import Engine
@@ -171,7 +171,7 @@ def read_later(
 ) -> Demonstrations:
     """Return demonstrations that a run is to score. Raises DataError that names the source, and what does not fit."""
     demonstrations, environment = read_any(source, keys, ends_are_failures)
-    check_dimension(results, demonstrations, source)
+    results.refuse_other_states(demonstrations, source)
     if environment and not is_same(environment, results.config.environment.id):
         raise DataError(f"{source}: recorded in {environment}, but the run is for {results.config.environment.id}")
     return demonstrations
