@@ -13,7 +13,7 @@ from gymnasium.envs.classic_control.pendulum import PendulumEnv
 
 FOLDER_VARIABLE = "OODIL_TEST_MISDEEDS"
 MISDEEDS = ("raises", "segfault", "exits", "stalls", "nan")
-CHANCE = 1 / 500
+CHANCE = 1 / 100
 """Of doing the next misdeed in a step."""
 
 

@@ -11,7 +11,6 @@ SHORT = [
     "transferability.reading.steps=5",
     "imitation.gail.total_steps=3_200",
     "imitation.gail.steps_per_rollout=20",
-    "imitation.num_trainings=1",
     "clustering.num_clusters=1",
     "evaluation.num_points=1",
     "evaluation.final_episodes=2",

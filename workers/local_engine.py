@@ -27,8 +27,11 @@ _PRELOAD = (
     "oodil.pipeline.training",
     "oodil.pipeline.algorithms.gail",
     "oodil.pipeline.algorithms.learner",
+    "torch._dynamo",
 )
-"""What children have loaded from the start: what they compute with, torch above all."""
+"""What children have loaded from the start: what they compute with, torch above all.
+
+torch imports its `_dynamo` with the first optimizer, which takes as long as all the rest."""
 
 
 class LocalEngine:

@@ -2,7 +2,7 @@
 
 from tests.runs import MICRO, run
 
-SMALL = ("imitation.gail.num_groups=2", "imitation.gail.simulators_per_group=1", "imitation.gail.steps_per_rollout=20")
+SMALL = ("imitation.gail.num_groups=2", "imitation.gail.simulators_per_group=1")
 
 
 def test_each_number_of_workers_has_its_row_and_one_is_named() -> None:

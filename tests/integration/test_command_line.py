@@ -168,7 +168,7 @@ def test_a_run_directory_of_another_run(tmp_path: Path) -> None:
         assert "another process is working on this run" in refused("resume", str(run_dir))
         # Its jobs read the configuration whenever one begins, so it must not change under them.
         before = (run_dir / "config.json").read_bytes()
-        changed = refused("run", str(MICRO), "imitation.gail.total_steps=48000", "--run-dir", str(run_dir))
+        changed = refused("run", str(MICRO), "imitation.gail.total_steps=9600", "--run-dir", str(run_dir))
         assert "another process is working on this run" in changed
         assert (run_dir / "config.json").read_bytes() == before
     described = json.loads(CliRunner().invoke(app, ["status", str(run_dir), "--json"]).output)

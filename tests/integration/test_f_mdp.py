@@ -16,7 +16,7 @@ from oodil.pipeline.stages.weighting import CannotScoreError
 from tests.runs import MICRO, artifacts, has_checkpoint
 
 pytestmark = pytest.mark.timeout(300)
-OVERRIDES = ["baselines=[f_mdp, f_mdp_per_source]", "f_mdp.steps_per_iteration=2000"]
+OVERRIDES = ["baselines=[f_mdp, f_mdp_per_source]", "f_mdp.steps_per_iteration=400"]
 WEIGHTINGS = ("feasibility", "feasibility_per_source")
 
 
@@ -53,8 +53,8 @@ def test_what_is_left_behind(results: RunResults) -> None:
         np.testing.assert_allclose(found.scores, np.exp(-np.minimum((distances - scale.nearest) / scale.alpha, 50)))
         np.testing.assert_allclose(found.weights, found.scores / found.scores.sum())
         assert (found.verdicts == "kept").all() and (found.clusters == -1).all()
-        # Our two clusters' imitators take 24,000 steps; then each demonstration is tracked once.
-        assert found.env_steps == 24_000 + (demonstrations.lengths - 1).sum()
+        # Our two clusters' imitators take 4,800 steps; then each demonstration is tracked once.
+        assert found.env_steps == 4_800 + (demonstrations.lengths - 1).sum()
     assert results.weighting(WEIGHTINGS[0]).scores.tolist() != results.weighting(WEIGHTINGS[1]).scores.tolist()
 
 
@@ -90,6 +90,6 @@ def test_what_it_depends_on_and_what_it_does_not(results: RunResults) -> None:
     unused = (f"{gail}.discriminator.hidden=[8]", f"{gail}.lag=0", f"{gail}.num_groups=4")
     assert state("clustering.temperature=0.5", *unused)[0] == "done"
     assert state("f_mdp.alpha=5") == ("stale", "f_mdp.alpha None -> 5.0")
-    assert state(f"{gail}.total_steps=13000") == ("stale", "steps 24000 -> 26000")
-    assert state("clustering.num_clusters=3") == ("stale", "steps 24000 -> 36000")
+    assert state(f"{gail}.total_steps=2600") == ("stale", "steps 4800 -> 5200")
+    assert state("clustering.num_clusters=3") == ("stale", "steps 4800 -> 7200")
     assert state(f"{gail}.gae_lambda=0.5") == ("stale", "learning.gae_lambda 0.97 -> 0.5")

@@ -17,7 +17,7 @@ from oodil.pipeline.results import load_value
 from tests.runs import MICRO, LiveRun, artifacts, has_checkpoint, run, wait_for
 
 pytestmark = pytest.mark.timeout(300)
-SMALL = ("finetuning.total_steps=9000",)  # 12 iterations
+SMALL = ("finetuning.total_steps=1800",)  # 12 iterations
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,7 @@ def test_the_noise_is_set_to_what_is_asked_for(base: oodil.RunResults, file: Pat
     config, _ = finetuning(base, file, ["finetuning.initial_std=0.2"])
     stage = stage_named("finetuning")
     assert isinstance(stage, FinetuningStage)
-    assert stage.gail(config).total_steps == 6000  # a quarter of 24,000
+    assert stage.gail(config).total_steps == 1200  # a quarter of 4,800
     demonstrations = base.demonstrations
     learner = imitator(12, 3, 1000, demonstrations, np.ones(len(demonstrations)), stage.gail(config), seed=5)
     stage.begin(Run(config, base.run.directory), learner)

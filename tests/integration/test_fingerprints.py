@@ -46,7 +46,7 @@ RELEVANT = {
     "transferability.reading.steps=11": ("transferability", "reading.steps 10 -> 11"),
     "transferability.kept_from=0.25": ("transferability", "kept_from 0.5 -> 0.25"),
     "imitation.gail.discount=0.9": ("imitation", "gail.discount 0.995 -> 0.9"),
-    "imitation.num_candidates=1": ("imitation", "num_candidates 8 -> 1"),
+    "imitation.num_candidates=1": ("imitation", "num_candidates 2 -> 1"),
     MARKS: ("marks", "transferable[1] False -> True"),
 }
 

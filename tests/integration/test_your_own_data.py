@@ -23,7 +23,7 @@ pytestmark = pytest.mark.timeout(300)
 DATA_SET = "mine/hopper-v0"
 SMALL = """clustering.num_clusters=2 clustering.joint_iterations=15 transferability.gail.total_steps=8000
 transferability.gail.num_groups=2 evaluation.num_scores=4 imitation.gail.total_steps=8000
-evaluation.num_points=1 evaluation.final_episodes=2"""
+imitation.num_trainings=1 imitation.num_candidates=2 evaluation.num_points=1 evaluation.final_episodes=2"""
 
 
 def make_data_set() -> None:

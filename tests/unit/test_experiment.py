@@ -90,13 +90,13 @@ def test_only_what_the_methods_need_is_computed(experiment, tmp_path):
     chosen = table.select(["1:2"], ["naive_gail"])
     found = {run: [stage.name for stage in stages] for run, stages in chosen.items()}
     assert found == {f"1-2-seed{seed}": ["demonstrations", "naive_gail"] for seed in (3, 4)}
-    # 24,000 steps in iterations of 4 groups x 2 simulators x 100 steps, and 8 x 8 + 16 episodes that measure.
-    assert [each.cost.env_steps for each in outlook(table, chosen)] == [104_000, 104_000]
+    # 4,800 steps in iterations of 4 groups x 2 simulators x 20 steps, and 2 x 8 + 16 episodes that measure.
+    assert [each.cost.env_steps for each in outlook(table, chosen)] == [36_800, 36_800]
     everything = {each.name: each for each in outlook(table, table.select(None, None))}
-    # The longest first: 2 clusters x 12,000 steps, of which 16 episodes measure and 32 are read, and two policies.
+    # The longest first: 2 clusters x 2,400 steps, of which 16 episodes measure and 32 are read, and two policies.
     assert next(iter(everything)) == "1-2-seed3"
-    assert everything["1-2-seed3"].cost.env_steps == 2 * (12_000 + 48_000) + 2 * 104_000
-    assert everything["1-2-kept-seed3"].cost.env_steps == 104_000
+    assert everything["1-2-seed3"].cost.env_steps == 2 * (2_400 + 48_000) + 2 * 36_800
+    assert everything["1-2-kept-seed3"].cost.env_steps == 36_800
     assert everything["1-2-kept-seed3"].own == ["imitation"]
     assert everything["1-2-plain-seed3"].shared == ["demonstrations"]
     assert not list(tmp_path.glob("micro*"))
