@@ -16,7 +16,9 @@ from oodil.pipeline.stages.weighting import CannotScoreError
 from tests.runs import MICRO, artifacts, has_checkpoint
 
 pytestmark = pytest.mark.timeout(300)
-OVERRIDES = ["baselines=[f_mdp, f_mdp_per_source]", "f_mdp.steps_per_iteration=400"]
+LONGER = ["transferability.gail.total_steps=6_000", "transferability.gail.steps_per_rollout=50"]
+"""An iteration of f-MDP is a whole episode of 1000 steps, and six of them have to be there to be stopped in."""
+OVERRIDES = ["baselines=[f_mdp, f_mdp_per_source]", "f_mdp.steps_per_iteration=400", *LONGER]
 WEIGHTINGS = ("feasibility", "feasibility_per_source")
 
 
@@ -53,8 +55,8 @@ def test_what_is_left_behind(results: RunResults) -> None:
         np.testing.assert_allclose(found.scores, np.exp(-np.minimum((distances - scale.nearest) / scale.alpha, 50)))
         np.testing.assert_allclose(found.weights, found.scores / found.scores.sum())
         assert (found.verdicts == "kept").all() and (found.clusters == -1).all()
-        # Our two clusters' imitators take 4,800 steps; then each demonstration is tracked once.
-        assert found.env_steps == 4_800 + (demonstrations.lengths - 1).sum()
+        # Our two clusters' imitators take 12,000 steps; then each demonstration is tracked once.
+        assert found.env_steps == 12_000 + (demonstrations.lengths - 1).sum()
     assert results.weighting(WEIGHTINGS[0]).scores.tolist() != results.weighting(WEIGHTINGS[1]).scores.tolist()
 
 
@@ -90,6 +92,6 @@ def test_what_it_depends_on_and_what_it_does_not(results: RunResults) -> None:
     unused = (f"{gail}.discriminator.hidden=[8]", f"{gail}.lag=0", f"{gail}.num_groups=4")
     assert state("clustering.temperature=0.5", *unused)[0] == "done"
     assert state("f_mdp.alpha=5") == ("stale", "f_mdp.alpha None -> 5.0")
-    assert state(f"{gail}.total_steps=2600") == ("stale", "steps 4800 -> 5200")
-    assert state("clustering.num_clusters=3") == ("stale", "steps 4800 -> 7200")
+    assert state(f"{gail}.total_steps=6500") == ("stale", "steps 12000 -> 13000")
+    assert state("clustering.num_clusters=3") == ("stale", "steps 12000 -> 18000")
     assert state(f"{gail}.gae_lambda=0.5") == ("stale", "learning.gae_lambda 0.97 -> 0.5")
