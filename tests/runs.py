@@ -1,4 +1,4 @@
-"""Whole runs in processes of their own, as a user starts them, for the tests that kill them."""
+"""Whole runs as a user starts them, and, for the tests that kill them, in processes of their own."""
 
 import os
 import signal
@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import psutil
+from typer.testing import CliRunner
 
 import oodil
+from oodil.cli import app
 
 ROOT = Path(__file__).parents[1]
 MICRO = ROOT / "tests" / "micro.yaml"
@@ -91,10 +93,10 @@ def has_checkpoint(run_dir: Path, stage: str, job: str, at_least: int) -> Callab
 
 
 def run(*arguments: str) -> str:
-    """Run a command to its end; it must succeed. Returns its output."""
-    code, output = LiveRun(*arguments).finish()
-    assert code == 0, output
-    return output
+    """Run a command to its end in this process, where all is loaded; it must succeed. Returns its output."""
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, (result.output, result.exception)
+    return result.output
 
 
 def artifacts(run_dir: Path) -> dict[str, str]:
