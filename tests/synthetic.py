@@ -149,8 +149,16 @@ class Writer:
         none = np.full(len(scores), -1, np.int32)
         self.write("marks", exact(scores, scores / max(scores.sum(), 1), none).files())
 
-    def policy(self, stage: str, mean: float, episodes: int = 32, env_steps: int = 5_000_000, points: int = 12) -> None:
-        """A learning curve that ends near the final return."""
+    def policy(
+        self,
+        stage: str,
+        mean: float,
+        episodes: int = 32,
+        env_steps: int = 5_000_000,
+        points: int = 12,
+        jobs: tuple[str, str] = ("training-2", "training-1"),
+    ) -> None:
+        """A learning curve that ends near the final return; of the trainings the first is kept."""
         steps = np.linspace(400_000, env_steps, points).astype(np.int64)
         curve = LearningCurve(
             env_steps=steps,
@@ -175,9 +183,9 @@ class Writer:
             action_high=np.ones(3, np.float32),
             env_steps=env_steps,
         )
-        kept = Training("training-2", env_steps, env_steps, 0.2, final.mean_return)
+        kept = Training(jobs[0], env_steps, env_steps, 0.2, final.mean_return)
         # No return decides which is kept.
-        other = Training("training-1", env_steps, env_steps * 3 // 4, 0.3, 2 * final.mean_return)
+        other = Training(jobs[1], env_steps, env_steps * 3 // 4, 0.3, 2 * final.mean_return)
         self.write(stage, policy.files() | curve.files() | final.files() | Trainings((kept, other)).files())
 
     def steps(self) -> dict[str, Callable[[], None]]:

@@ -118,7 +118,7 @@ class ImitationConfig(Section):
     the last of the closest is what the training gives. With 1 it is the end, as in the paper."""
     warm_start: bool = True
     """Whether our policy goes on from the imitator of the cluster that it learns most from, with a standard deviation
-    of `least_std`, instead of beginning anew as baselines do, and as in the paper."""
+    of `least_std`, in every training but each second one. Those begin anew, as baselines do, and as in the paper."""
 
 
 class FinetuningConfig(Section):

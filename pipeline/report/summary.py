@@ -204,10 +204,12 @@ def notes(found: Findings) -> list[Note]:
         named = ", ".join(f"{found.title(name)} {formats.count(steps)}" for name, steps in env_steps.items())
         told.append(Note(f"The policies were trained for different numbers of environment steps ({named})."))
     ours = results.policies[0]
-    if len(found.finals) > 1 and ours.name in found.finals and ours.is_warm_started(results.config):
+    if len(found.finals) > 1 and ours.name in found.finals:
+        kept = results.trainings(ours.name).trainings[0].job
+        goes_on = "Our policy goes on from the imitator of a cluster, where the others begin anew. "
         text = (
-            "Our policy goes on from the imitator of a cluster, where the others begin anew. With all imitators and "
-            f"the readings of their scores, ours took {formats.count(results.env_steps_of(ours))} environment steps."
+            f"{goes_on if ours.goes_on(results.config, kept) else ''}With all imitators and the readings of their "
+            f"scores, ours took {formats.count(results.env_steps_of(ours))} environment steps."
         )
         told.append(Note(text))
     if found.sources and not found.sources.fully_marked:

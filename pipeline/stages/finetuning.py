@@ -17,7 +17,7 @@ from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.results import Policy, Transferability, load_value
 from oodil.pipeline.stage import JobContext, Run, base_run, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
-from oodil.pipeline.stages.policies import PolicyStage, refuse_other_widths
+from oodil.pipeline.stages.policies import FIRST, PolicyStage, refuse_other_widths
 from oodil.pipeline.stages.weighting import Weighting
 
 if TYPE_CHECKING:
@@ -87,14 +87,14 @@ class FinetuningStage(PolicyStage):
             )
         refuse_other_widths("the policy that is continued", _base(config).config.imitation.gail, gail)
 
-    def gail(self, config: RunConfig) -> GailConfig:
-        """Return how each training is done: as the policy's was, for a part of its steps and with less noise."""
+    def gail(self, config: RunConfig, job: str = FIRST) -> GailConfig:
+        """Return how a training is done: as the policy's was, for a part of its steps and with less noise."""
         gail, section = config.imitation.gail, config.finetuning
         steps = section.total_steps or max(1, gail.total_steps // SHARE_OF_STEPS)
         return gail.model_copy(update={"total_steps": steps, "initial_log_std": log(section.initial_std)})
 
-    def is_warm_started(self, config: RunConfig) -> bool:
-        """It is, always."""
+    def goes_on(self, config: RunConfig, job: str) -> bool:
+        """Each does."""
         return True
 
     def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> None:

@@ -9,7 +9,7 @@ from oodil.pipeline.config import GailConfig, RunConfig
 from oodil.pipeline.results import Imitator, Transferability
 from oodil.pipeline.stage import Run, register
 from oodil.pipeline.stages.imitators import ImitatorsStage
-from oodil.pipeline.stages.policies import PolicyStage, refuse_other_widths
+from oodil.pipeline.stages.policies import FIRST, PolicyStage, refuse_other_widths
 from oodil.pipeline.stages.transferability import TransferabilityStage
 
 if TYPE_CHECKING:
@@ -18,7 +18,13 @@ if TYPE_CHECKING:
 
 
 class ImitationStage(PolicyStage):
-    """Weighted GAIL that begins where the job of a cluster ended: what was learned there is not learned twice."""
+    """Weighted GAIL, every second training of which begins anew.
+
+    The others, the first among them, begin where the job of a cluster ended: what was learned there is not learned
+    twice. But a policy that does one thing well may never find another, so not all trainings have that in common.
+    """
+
+    version = 7
 
     def __init__(self) -> None:
         super().__init__("imitation", title="ours", weighting=TransferabilityStage.name)
@@ -26,24 +32,24 @@ class ImitationStage(PolicyStage):
 
     def check(self, config: RunConfig) -> None:
         """Refuse networks of other widths than those that are continued."""
-        if self.is_warm_started(config):
+        if config.imitation.warm_start:
             name = "transferability.gail, which it goes on from unless imitation.warm_start is false,"
             refuse_other_widths(name, config.transferability.gail, config.imitation.gail)
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
-        """Return what a training depends on, where it begins included."""
+        """Return what a training depends on, where the first begins included."""
         return super().job_settings(config) | {"warm_start": config.imitation.warm_start}
 
-    def gail(self, config: RunConfig) -> GailConfig:
-        """Return how each training is done: with less noise at first, if it is no beginner's."""
+    def gail(self, config: RunConfig, job: str = FIRST) -> GailConfig:
+        """Return how a training is done: with less noise at first, if it is no beginner's."""
         gail = config.imitation.gail
-        if self.is_warm_started(config):
+        if self.goes_on(config, job):
             return gail.model_copy(update={"initial_log_std": log(gail.least_std)})
         return gail
 
-    def is_warm_started(self, config: RunConfig) -> bool:
-        """Return whether it goes on from an imitator."""
-        return config.imitation.warm_start
+    def goes_on(self, config: RunConfig, job: str) -> bool:
+        """Return whether a training goes on from an imitator."""
+        return config.imitation.warm_start and int(job.removeprefix("training-")) % 2 == 1
 
     def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> None:
         """Take over policy and value function of the cluster of which most transitions are drawn."""

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from oodil.pipeline.algorithms.learner import Learner
 
 
+FIRST = "training-1"
+"""The training that there is in every run."""
+
+
 class PolicyStage(Stage):
     """Weighted GAIL under a name: one learner fed by rollout workers.
 
@@ -55,16 +59,16 @@ class PolicyStage(Stage):
         candidates = config.imitation.num_candidates
         return {"gail": gail, "num_candidates": candidates, "environment": config.environment.settings()}
 
-    def gail(self, config: RunConfig) -> GailConfig:
-        """Return how each training is done."""
+    def gail(self, config: RunConfig, job: str = FIRST) -> GailConfig:
+        """Return how a training is done."""
         return config.imitation.gail
 
-    def is_warm_started(self, config: RunConfig) -> bool:
-        """Return whether its trainings `begin` with something that has been trained before."""
+    def goes_on(self, config: RunConfig, job: str) -> bool:
+        """Return whether a training begins with something that has been trained before."""
         return False
 
     def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> None:
-        """Bring a new learner to where its training begins, if that is warm started."""
+        """Bring a new learner to where a training begins that `goes_on`."""
 
     def jobs(self, run: Run) -> list[str]:
         """Return the trainings."""
@@ -103,7 +107,7 @@ class PolicyStage(Stage):
         from oodil.pipeline.training import Probe, train
 
         config, evaluation = run.config, run.config.evaluation
-        environment, gail = config.environment, self.gail(config)
+        environment, gail = config.environment, self.gail(config, job)
         spec = environment_spec(environment.id, environment.dynamics)
         # The same seeds for all policies: they differ in their weights, and in where `begin` brings them.
         seed = torch_seed(derive_key(config.seed, "imitation", job))
@@ -118,7 +122,7 @@ class PolicyStage(Stage):
             return np.array([seen.mean_return, seen.std_return, seen.mean_length])
 
         known = []
-        if self.is_warm_started(config):
+        if self.goes_on(config, job):
             self.begin(run, learner)
             known = [curve_point()] if evaluation.num_points else []
         candidates = Candidates(learner, environment, config.imitation.num_candidates)
@@ -159,7 +163,7 @@ class PolicyStage(Stage):
 class AllStepsPolicy(PolicyStage):
     """A policy with as many environment steps as all our trainings take, those of the clusters' imitators included."""
 
-    def gail(self, config: RunConfig) -> GailConfig:
+    def gail(self, config: RunConfig, job: str = FIRST) -> GailConfig:
         """Return the training of our policy, with its share of the clusters' steps."""
         gail, share = config.imitation.gail, -(-config.cluster_steps // config.imitation.num_trainings)
         return gail.model_copy(update={"total_steps": gail.total_steps + share})

@@ -112,7 +112,7 @@ def test_it_begins_with_the_policy_of_the_run(base: oodil.RunResults, tuned: ood
     before, curve = base.curve(), tuned.curve("finetuning")
     assert curve.env_steps.tolist() == [0, 960, 1920]
     assert (curve.mean_return[0], curve.mean_length[0]) == (before.mean_return[-1], before.mean_length[-1])
-    assert tuned.policy("finetuning").env_steps == 9600
+    assert tuned.policy("finetuning").env_steps == 1920
     assert load_value(base.artifact("imitation")).keys() == load_value(tuned.artifact("finetuning")).keys()
     # Inputs are still those that the networks were trained with; the noise has shrunk again.
     np.testing.assert_array_equal(tuned.policy("finetuning").gaussian.input_mean, base.policy().gaussian.input_mean)

@@ -12,7 +12,7 @@ from oodil.pipeline.algorithms.weights import share_lasted, transferability_of_d
 from oodil.pipeline.environments.locomotion import HopperEnv
 from oodil.pipeline.evaluation import evaluate
 from oodil.pipeline.loading import load_config
-from oodil.pipeline.results import Imitator, Reading, Trainings
+from oodil.pipeline.results import Imitator, LearningCurve, Reading, Trainings
 from oodil.pipeline.seeding import derive_key
 from oodil.workers.channels import endpoint_folder
 from tests.runs import MICRO, LiveRun, artifacts, has_checkpoint, nothing_left, run, wait_for
@@ -161,6 +161,8 @@ def test_one_more_training_of_a_policy_reuses_the_first_and_the_closest_is_kept(
         assert results.artifact(name).hashes["policy.safetensors"] == kept.hashes["policy.safetensors"]
         one, two = (artifact.hashes["policy.safetensors"] for artifact in jobs.values())
         assert one != two, "both have the same seed"
+        begun = [LearningCurve.load(artifact).env_steps[0] == 0 for artifact in jobs.values()]
+        assert begun == [name == "imitation", False], "the second training begins anew, whatever the first does"
 
 
 @pytest.mark.parametrize("workers", [1, 4])
