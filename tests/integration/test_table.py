@@ -115,7 +115,8 @@ def test_an_interrupt_stops_politely(whole: Path, tmp_path: Path) -> None:
     found = json.loads((tmp_path / "micro" / "results.json").read_bytes())
     assert not found["cells"] and not found["failed"] and len(found["missing"]) == 8
     # What is asked for is all that is computed; what is there already is shown.
-    run(*command(tmp_path, 1, "--rows", "all", "--methods", "naive_gail"))
+    code, output = LiveRun(*command(tmp_path, 1, "--rows", "all", "--methods", "naive_gail")).finish()
+    assert code == 0, output
     assert len(json.loads((tmp_path / "micro" / "results.json").read_bytes())["cells"]) == 2
     run(*command(tmp_path, 2))
     assert (tmp_path / "micro" / "results.json").read_bytes() == (whole / "results.json").read_bytes()
