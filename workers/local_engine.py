@@ -31,7 +31,7 @@ _PRELOAD = (
 )
 """What children have loaded from the start: what they compute with, torch above all.
 
-torch imports its `_dynamo` with the first optimizer, which takes as long as all the rest."""
+torch imports its `_dynamo` with the first optimizer, in as much time as itself."""
 
 
 class LocalEngine:

@@ -110,9 +110,12 @@ class Learner(Generic[Reward]):
         """Return a copy of the value function's parameters by name."""
         return {name: value.numpy().copy() for name, value in self.value.state_dict().items()}
 
-    def continue_from(self, policy: GaussianPolicy, value: dict[str, NDArray[np.float32]]) -> None:
-        """Begin with a trained policy, but for its noise, and with the value function that was trained with it."""
+    def continue_from(self, policy: GaussianPolicy, value: dict[str, NDArray[np.float32]], std: float) -> None:
+        """Begin with a trained policy, its noise set to ``std``, and with the value function trained with it."""
+        self.config = self.config.model_copy(update={"initial_log_std": float(np.log(std))})
         self.policy.load_mean(policy)
+        with torch.no_grad():
+            self.policy.log_std.fill_(self.config.initial_log_std)
         self.value.load_state_dict({name: torch.from_numpy(each) for name, each in value.items()})
 
     def update(self, batch: TransitionBatch, iteration: int) -> dict[str, float]:

@@ -5,7 +5,6 @@ and then the later ones; its stages here weigh them by a frozen weighting of tha
 """
 
 from dataclasses import replace
-from math import log
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from oodil.pipeline.errors import ConfigError
 from oodil.pipeline.results import Policy, Transferability, load_value
 from oodil.pipeline.stage import JobContext, Run, base_run, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
-from oodil.pipeline.stages.policies import FIRST, PolicyStage, refuse_other_widths
+from oodil.pipeline.stages.policies import PolicyStage, refuse_other_widths
 from oodil.pipeline.stages.weighting import Weighting
 
 if TYPE_CHECKING:
@@ -76,7 +75,8 @@ class FinetuningStage(PolicyStage):
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return what a training depends on, the policy it begins with included."""
-        return super().job_settings(config) | {"base": _policy(config).sha256}
+        own = {"base": _policy(config).sha256, "initial_std": config.finetuning.initial_std}
+        return super().job_settings(config) | own
 
     def check(self, config: RunConfig) -> None:
         """Refuse noise that could not shrink, and networks of other widths than those that are continued."""
@@ -87,20 +87,20 @@ class FinetuningStage(PolicyStage):
             )
         refuse_other_widths("the policy that is continued", _base(config).config.imitation.gail, gail)
 
-    def gail(self, config: RunConfig, job: str = FIRST) -> GailConfig:
-        """Return how a training is done: as the policy's was, for a part of its steps and with less noise."""
-        gail, section = config.imitation.gail, config.finetuning
-        steps = section.total_steps or max(1, gail.total_steps // SHARE_OF_STEPS)
-        return gail.model_copy(update={"total_steps": steps, "initial_log_std": log(section.initial_std)})
+    def gail(self, config: RunConfig) -> GailConfig:
+        """Return how each training is done: as the policy's was, for a part of its steps."""
+        gail = config.imitation.gail
+        steps = config.finetuning.total_steps or max(1, gail.total_steps // SHARE_OF_STEPS)
+        return gail.model_copy(update={"total_steps": steps})
 
     def goes_on(self, config: RunConfig, job: str) -> bool:
         """Each does."""
         return True
 
     def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> None:
-        """Take over policy and value function."""
+        """Take over policy and value function, with the noise that is asked for."""
         trained = _policy(run.config)
-        learner.continue_from(Policy.load(trained).gaussian, load_value(trained))
+        learner.continue_from(Policy.load(trained).gaussian, load_value(trained), run.config.finetuning.initial_std)
 
 
 def _base(config: RunConfig) -> Run:

@@ -1,15 +1,14 @@
 """Stage 5, of the method: its policy goes on from the imitator of what it learns most from."""
 
-from math import log
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from oodil.pipeline.config import GailConfig, RunConfig
+from oodil.pipeline.config import RunConfig
 from oodil.pipeline.results import Imitator, Transferability
 from oodil.pipeline.stage import Run, register
 from oodil.pipeline.stages.imitators import ImitatorsStage
-from oodil.pipeline.stages.policies import FIRST, PolicyStage, refuse_other_widths
+from oodil.pipeline.stages.policies import PolicyStage, refuse_other_widths
 from oodil.pipeline.stages.transferability import TransferabilityStage
 
 if TYPE_CHECKING:
@@ -37,26 +36,19 @@ class ImitationStage(PolicyStage):
             refuse_other_widths(name, config.transferability.gail, config.imitation.gail)
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
-        """Return what a training depends on, where the first begins included."""
+        """Return what a training depends on, where those begin that go on included."""
         return super().job_settings(config) | {"warm_start": config.imitation.warm_start}
-
-    def gail(self, config: RunConfig, job: str = FIRST) -> GailConfig:
-        """Return how a training is done: with less noise at first, if it is no beginner's."""
-        gail = config.imitation.gail
-        if self.goes_on(config, job):
-            return gail.model_copy(update={"initial_log_std": log(gail.least_std)})
-        return gail
 
     def goes_on(self, config: RunConfig, job: str) -> bool:
         """Return whether a training goes on from an imitator."""
         return config.imitation.warm_start and int(job.removeprefix("training-")) % 2 == 1
 
     def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> None:
-        """Take over policy and value function of the cluster of which most transitions are drawn."""
+        """Take over policy and value function of the cluster of which most transitions are drawn, with less noise."""
         found = Transferability.load(run.artifact(TransferabilityStage.name))
         drawn = np.bincount(found.clusters, found.weights * (self.demonstrations(run).lengths - 1))
         imitator = Imitator.load(run.job_artifact(ImitatorsStage.name, found.read_from[int(drawn.argmax())]))
-        learner.continue_from(imitator.policy, imitator.value)
+        learner.continue_from(imitator.policy, imitator.value, run.config.imitation.gail.least_std)
 
 
 register(ImitationStage())

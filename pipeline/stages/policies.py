@@ -23,10 +23,6 @@ if TYPE_CHECKING:
     from oodil.pipeline.algorithms.learner import Learner
 
 
-FIRST = "training-1"
-"""The training that there is in every run."""
-
-
 class PolicyStage(Stage):
     """Weighted GAIL under a name: one learner fed by rollout workers.
 
@@ -59,8 +55,8 @@ class PolicyStage(Stage):
         candidates = config.imitation.num_candidates
         return {"gail": gail, "num_candidates": candidates, "environment": config.environment.settings()}
 
-    def gail(self, config: RunConfig, job: str = FIRST) -> GailConfig:
-        """Return how a training is done."""
+    def gail(self, config: RunConfig) -> GailConfig:
+        """Return how each training is done."""
         return config.imitation.gail
 
     def goes_on(self, config: RunConfig, job: str) -> bool:
@@ -107,7 +103,7 @@ class PolicyStage(Stage):
         from oodil.pipeline.training import Probe, train
 
         config, evaluation = run.config, run.config.evaluation
-        environment, gail = config.environment, self.gail(config, job)
+        environment, gail = config.environment, self.gail(config)
         spec = environment_spec(environment.id, environment.dynamics)
         # The same seeds for all policies: they differ in their weights, and in where `begin` brings them.
         seed = torch_seed(derive_key(config.seed, "imitation", job))
@@ -163,7 +159,7 @@ class PolicyStage(Stage):
 class AllStepsPolicy(PolicyStage):
     """A policy with as many environment steps as all our trainings take, those of the clusters' imitators included."""
 
-    def gail(self, config: RunConfig, job: str = FIRST) -> GailConfig:
+    def gail(self, config: RunConfig) -> GailConfig:
         """Return the training of our policy, with its share of the clusters' steps."""
         gail, share = config.imitation.gail, -(-config.cluster_steps // config.imitation.num_trainings)
         return gail.model_copy(update={"total_steps": gail.total_steps + share})

@@ -132,6 +132,27 @@ def test_a_server_has_one_thread_and_torch() -> None:
         server.kill()
 
 
+def optimize(link: int, server: int, into: str) -> None:
+    """A child that makes an optimizer, and notes what had to be loaded for that."""
+    import torch
+
+    loaded = set(sys.modules)
+    torch.optim.Adam([torch.zeros(1)])
+    Path(into).write_text(" ".join(set(sys.modules) - loaded))
+    os._exit(0)
+
+
+def test_a_child_loads_nothing_for_its_first_optimizer(tmp_path: Path) -> None:
+    server = ForkServer(_PRELOAD)
+    try:
+        child = server.start(optimize, {"into": str(tmp_path / "loaded")})
+        assert child.join(60.0) == 0
+        child.close()
+        assert (tmp_path / "loaded").read_text() == ""
+    finally:
+        server.kill()
+
+
 def test_an_idle_server_ends_and_the_next_start_finds_another(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fork_server, "IDLE_S", 0.1)
     server = ForkServer(())

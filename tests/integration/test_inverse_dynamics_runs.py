@@ -119,5 +119,5 @@ def test_later_demonstrations_are_scored_without_training(run_dir: Path, name: s
     assert again.env_steps > 0
     few = results.score(demonstrations.select(np.array([0, 5])), name)
     np.testing.assert_allclose(few.scores, held.scores[[0, 5]], atol=0.05)
-    with pytest.raises(DataError, match="demonstrations: states have 4 dimensions"):
+    with pytest.raises(DataError, match=r"demonstrations: states have 4 dimensions; those of .* have \d+$"):
         results.score(replace(demonstrations, observations=demonstrations.observations[:, :4].copy()), name)
