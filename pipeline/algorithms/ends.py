@@ -3,12 +3,15 @@
 Letters: N demonstrations, E ends of episodes, P known states, S observation.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from oodil.pipeline.algorithms.standardization import standardization
-from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.policy import LARGEST_INPUT
 from oodil.pipeline.seeding import Key, numpy_rng
 
@@ -28,6 +31,7 @@ class DemonstratedEnds:
         self, demonstrations: Demonstrations, weights: NDArray[np.float64], max_episode_steps: int, key: Key
     ) -> None:
         """Draw states in proportion to the (N,) weights of their demonstrations."""
+        self._max_episode_steps = max_episode_steps
         steps = demonstrations.lengths - 1
         each = np.repeat(weights, demonstrations.lengths)
         self._mean, self._scale = standardization(demonstrations.observations, each)
@@ -44,6 +48,20 @@ class DemonstratedEnds:
             return np.zeros(len(states), np.bool_)
         _, nearest = self._known.query(self._standardized(states))
         return np.asarray(self._is_last[nearest])
+
+    def until_limit(self, episodes: Sequence[Episode]) -> list[Episode]:
+        """Return episodes of which those that fail, as no demonstration ends where they do, stay there.
+
+        One that fails has few transitions. What it does not do any more would not be seen if it did not last until
+        the time limit.
+        """
+        demonstrated = self.include(np.stack([episode.states[-1] for episode in episodes]))
+        failed = [episode.terminated and not ended for episode, ended in zip(episodes, demonstrated, strict=True)]
+        return [self._lasting(each) if fails else each for each, fails in zip(episodes, failed, strict=True)]
+
+    def _lasting(self, episode: Episode) -> Episode:
+        missing = max(0, self._max_episode_steps + 1 - len(episode.states))
+        return replace(episode, states=np.pad(episode.states, ((0, missing), (0, 0)), mode="edge"))
 
     def _standardized(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.clip((states - self._mean) * self._scale, -LARGEST_INPUT, LARGEST_INPUT)

@@ -56,7 +56,6 @@ class AdversarialReward:
         self._cumulative = np.cumsum(np.repeat(weights, demonstrations.lengths - 1))
         self._state_weights = np.repeat(weights, demonstrations.lengths)
         self._observations = demonstrations.observations
-        self._max_episode_steps = max_episode_steps
         self._ends = DemonstratedEnds(demonstrations, weights, max_episode_steps, derive_key(root_seed, "ends"))
         seed = torch_seed(derive_key(root_seed, "discriminator", "initial"))
         self.discriminator = Discriminator(demonstrations, weights, config, seed)
@@ -91,16 +90,11 @@ class AdversarialReward:
         """Return how far episodes are from the weighted demonstrations, in deviations of what the discriminator sees.
 
         It is the sliced Wasserstein distance of their transitions, which asks for no reward and for no discriminator.
-        An episode that fails, as no demonstration ends where it does, stays there until the time limit: it has few
-        transitions, and what is missing would not be seen.
+        Episodes that fail last until the time limit (`DemonstratedEnds.until_limit`).
         """
         rng = numpy_rng(derive_key(self.root_seed, "distance"))
         shown = self.draw(DISTANCE_TRANSITIONS, rng)
-        ends = self.goes_on(np.stack([episode.states[-1] for episode in episodes]))
-        paths = [
-            episode.states if ended or not episode.terminated else _held(episode.states, self._max_episode_steps + 1)
-            for episode, ended in zip(episodes, ends, strict=True)
-        ]
+        paths = [episode.states for episode in self._ends.until_limit(episodes)]
         states, successors = (np.concatenate([path[part] for path in paths]) for part in (np.s_[:-1], np.s_[1:]))
         return sliced_wasserstein(shown.numpy(), self.discriminator.inputs(states, successors).numpy(), rng)
 
@@ -136,11 +130,6 @@ class AdversarialReward:
             states, successors = batch.observations.reshape(shape), batch.next_observations.reshape(shape)
             self._policy_inputs = batch, self.discriminator.inputs(states, successors)
         return self._policy_inputs[1]
-
-
-def _held(states: NDArray[np.floating], length: int) -> NDArray[np.floating]:
-    """Return (T, S) states of an episode, with the last one repeated until there are ``length``."""
-    return np.concatenate([states, np.repeat(states[-1:], max(0, length - len(states)), axis=0)])
 
 
 def imitator(

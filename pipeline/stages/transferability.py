@@ -18,7 +18,7 @@ from oodil.pipeline.algorithms.weights import (
 )
 from oodil.pipeline.artifacts import Files
 from oodil.pipeline.config import RunConfig
-from oodil.pipeline.data import Demonstrations
+from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.environments import environment_spec, make_batch
 from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.policy import GaussianPolicy
@@ -46,7 +46,7 @@ class TransferabilityStage(Weighting):
 
     name = "transferability"
     title = "ours"
-    version = 6
+    version = 7
     jobs_are_read = True
     inputs = ("demonstrations", "clustering", "imitators")
 
@@ -98,14 +98,16 @@ class TransferabilityStage(Weighting):
             divergences = readers.divergences(cluster.demonstrations)
             return Reading(cluster.members, divergences, env_steps=0, readers=imitator.discriminator).files()
         played = self._episodes(run.config, cluster, imitator.policy)
-        divergences = readers.train(played, context.progress)
-        return Reading(cluster.members, divergences, int((played.lengths - 1).sum()), readers.arrays()).files()
+        env_steps = sum(len(episode.states) - 1 for episode in played)
+        lasting = Demonstrations.of(cluster.ends(run.config).until_limit(played), "imitator")
+        divergences = readers.train(lasting, context.progress)
+        return Reading(cluster.members, divergences, env_steps, readers.arrays()).files()
 
-    def _episodes(self, config: RunConfig, cluster: ClusterJob, policy: GaussianPolicy) -> Demonstrations:
-        """Return fresh episodes of an imitator, with the noise that it has been trained to."""
+    def _episodes(self, config: RunConfig, cluster: ClusterJob, policy: GaussianPolicy) -> list[Episode]:
+        """Return fresh episodes of an imitator's mean actions: noise is no part of what it can do."""
         simulators = make_batch(config.environment.id, config.environment.dynamics, READ_EPISODES)
         rng, starts = numpy_rng(derive_key(cluster.seed, "episodes")), cluster.starts(config)
-        return Demonstrations.of(run_episodes(simulators, policy, rng, stochastic=True, starts=starts), "imitator")
+        return run_episodes(simulators, policy, rng, stochastic=False, starts=starts)
 
     def combine(self, run: Run) -> Files:
         """Take each cluster's closest imitator and turn its readings into scores, verdicts and weights."""

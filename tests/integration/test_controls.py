@@ -1,11 +1,17 @@
-"""Two controls of the transferability itself, with real training in a gravity that is not the demonstrators': what no
-physics can do comes out far below what an expert did, and a robot that does nothing and falls weighs almost nothing."""
+"""Controls of the transferability itself.
+
+With real training in a gravity that is not the demonstrators': what no physics can do comes out far below what an
+expert did, and a robot that does nothing and falls weighs almost nothing. With a known imitator: of what follows a
+failure nothing is reproduced.
+"""
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from oodil.orchestrator import execute
 from oodil.pipeline.algorithms.weights import sampling_mass
@@ -15,7 +21,15 @@ from oodil.pipeline.datasets import encode_demonstrations
 from oodil.pipeline.environments import make_batch
 from oodil.pipeline.evaluation import run_episodes
 from oodil.pipeline.loading import parse_config
-from oodil.pipeline.results import Assignment, CollectedDemonstrations, Transferability
+from oodil.pipeline.policy import GaussianPolicy
+from oodil.pipeline.results import (
+    Assignment,
+    CollectedDemonstrations,
+    Imitator,
+    ScoreHistory,
+    TrainedImitators,
+    Transferability,
+)
 from oodil.pipeline.seeding import numpy_rng
 from oodil.pipeline.stage import Run
 from oodil.pipeline.stages.experts import load_expert
@@ -56,29 +70,41 @@ def demonstrations() -> Demonstrations:
     return Demonstrations.joined(parts)
 
 
-def weighted(path: Path, seed: int, budget: int = BUDGET) -> tuple[Demonstrations, Transferability]:
-    """Train the imitators of both clusters and read them."""
-    shown = demonstrations()
+def prepared(
+    path: Path,
+    shown: Demonstrations,
+    clusters: NDArray[np.int32],
+    environment: dict[str, Any],
+    seed: int = 0,
+    budget: int = 1,
+    **settings: Any,
+) -> Run:
+    """Return a run whose demonstrations and clusters are known."""
     path.mkdir()
     file = path / "demonstrations.safetensors"
-    file.write_bytes(encode_demonstrations(shown, "oodil/Hopper-v0"))
+    file.write_bytes(encode_demonstrations(shown, environment["id"]))
     values = {
         "name": "controls",
         "seed": seed,
-        "environment": {"id": "oodil/Hopper-v0", "dynamics": IMITATOR},
+        "environment": environment,
         "demonstrations": {"file": str(file)},
-        "transferability": {"gail": {"total_steps": budget}},
+        "transferability": {"gail": {"total_steps": budget}, **settings},
         "imitation": {"gail": {"total_steps": 1}},
     }
-    config = parse_config(values, "controls")
-    run = Run(config, RunDirectory(path / "run"))
+    run = Run(parse_config(values, "controls"), RunDirectory(path / "run"))
     run.directory.path.mkdir()
-    run.directory.config.write_text(config.model_dump_json())
-    write_artifact(
-        run.directory.stage("demonstrations"), {}, CollectedDemonstrations(shown, (), "oodil/Hopper-v0").files()
-    )
-    assignment = Assignment(CLUSTERS, np.zeros((3 * COUNT, 2), np.float32))
+    run.directory.config.write_text(run.config.model_dump_json())
+    collected = CollectedDemonstrations(shown, (), environment["id"])
+    write_artifact(run.directory.stage("demonstrations"), {}, collected.files())
+    assignment = Assignment(clusters, np.zeros((len(shown), 2), np.float32))
     write_artifact(run.directory.stage("clustering"), {}, assignment.files())
+    return run
+
+
+def weighted(path: Path, seed: int, budget: int = BUDGET) -> tuple[Demonstrations, Transferability]:
+    """Train the imitators of both clusters and read them."""
+    shown = demonstrations()
+    run = prepared(path, shown, CLUSTERS, {"id": "oodil/Hopper-v0", "dynamics": IMITATOR}, seed, budget)
     weighting = TransferabilityStage()
     execute(run, [ImitatorsStage(), weighting], LocalEngine(2))
     return shown, weighting.load(run)
@@ -107,3 +133,38 @@ def test_doing_nothing_weighs_next_to_nothing(found: tuple[Demonstrations, Trans
     assert scores[GENUINE].min() > 0.05, scores
     assert scores[IDLE].max() < scores[GENUINE].min() / 2, scores
     assert sampling_mass(transferability.weights, shown)[IDLE].sum() < 0.05, scores
+
+
+NOTHING = {"of no use": np.zeros(1, np.float32)}
+"""Instead of networks that nobody asks."""
+
+
+def test_nothing_of_what_follows_a_crash_is_reproduced(tmp_path: Path) -> None:
+    """An imitator does exactly what was demonstrated. Where there is an obstacle it does half of it, and crashes.
+
+    Read up to there, it could not be told from the demonstrations.
+    """
+    curve = GaussianPolicy(
+        (np.zeros((5, 1), np.float32),),
+        (np.full(1, 0.02, np.float32),),
+        np.full(1, -10, np.float32),
+        np.zeros(5, np.float32),
+        np.ones(5, np.float32),
+    )
+    cars, start = make_batch("oodil/Driving-v0", {"obstacle_1": 0.05}, COUNT), np.array([[-0.5, -0.8, 0, 0, np.pi / 2]])
+    driven = run_episodes(cars, curve, numpy_rng((0,)), stochastic=False, starts=start.astype(np.float32))
+    shown = Demonstrations.of([Episode(episode.states) for episode in driven], "on a curve")
+    scores, reading = {}, {"steps": 300, "repetitions": 1}
+    for name, obstacle in (("free", 0.05), ("blocked", 0.4)):
+        environment = {"id": "oodil/Driving-v0", "dynamics": {"obstacle_1": obstacle}}
+        run = prepared(tmp_path / name, shown, np.zeros(COUNT, np.int32), environment, reading=reading)
+        imitator = Imitator(curve, NOTHING, NOTHING, distance=0.0, env_steps=0)
+        history = ScoreHistory(np.arange(COUNT), np.empty(0, np.int64), np.empty((0, COUNT)))
+        job = write_artifact(run.directory.job("imitators", "cluster-0"), {}, imitator.files() | history.files())
+        trained = TrainedImitators(env_steps=0, sha256={"cluster-0": job.sha256})
+        write_artifact(run.directory.stage("imitators"), {}, trained.files())
+        weighting = TransferabilityStage()
+        execute(run, [weighting], LocalEngine(0))
+        scores[name] = weighting.load(run).scores
+    assert scores["free"].min() > 0.9, scores
+    assert scores["blocked"].max() < 0.1, scores

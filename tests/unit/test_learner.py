@@ -289,6 +289,15 @@ class TestEnds:
             assert ends.include(asked).tolist() == expected
         assert ends.include(asked[:0]).shape == (0,)
 
+    def test_what_fails_stays_where_it_failed_until_the_time_limit(self):
+        ends = DemonstratedEnds(self.approaching((11,)), np.ones(1), 15, derive_key(0, "test"))
+        path = np.linspace(0, 0.5, 11, dtype=np.float32)[:, None]
+        arrived, stopped, failed = Episode(path, 1.0, True), Episode(path[:4], 2.0), Episode(path[:4], 3.0, True)
+        lasting = ends.until_limit([arrived, stopped, failed])
+        assert lasting[0] is arrived and lasting[1] is stopped
+        assert lasting[2].states.tolist() == path[:4].tolist() + 12 * path[3:4].tolist()
+        assert (lasting[2].env_return, lasting[2].terminated) == (3.0, True)
+
     def test_the_last_reward_goes_on_for_ever(self, demonstrations, rollout, monkeypatch):
         """With discount 1/2 a reward r for ever is worth 2 r."""
         config = GailConfig(total_steps=100, discount=0.5)
