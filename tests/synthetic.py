@@ -156,7 +156,7 @@ class Writer:
         episodes: int = 32,
         env_steps: int = 5_000_000,
         points: int = 12,
-        jobs: tuple[str, str] = ("training-2", "training-1"),
+        goes_on: bool = False,
     ) -> None:
         """A learning curve that ends near the final return; of the trainings the first is kept."""
         steps = np.linspace(400_000, env_steps, points).astype(np.int64)
@@ -183,9 +183,9 @@ class Writer:
             action_high=np.ones(3, np.float32),
             env_steps=env_steps,
         )
-        kept = Training(jobs[0], env_steps, env_steps, 0.2, final.mean_return)
+        kept = Training("training-2", goes_on, env_steps, env_steps, 0.2, final.mean_return)
         # No return decides which is kept.
-        other = Training(jobs[1], env_steps, env_steps * 3 // 4, 0.3, 2 * final.mean_return)
+        other = Training("training-1", False, env_steps, env_steps * 3 // 4, 0.3, 2 * final.mean_return)
         self.write(stage, policy.files() | curve.files() | final.files() | Trainings((kept, other)).files())
 
     def steps(self) -> dict[str, Callable[[], None]]:

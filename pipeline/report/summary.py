@@ -205,10 +205,10 @@ def notes(found: Findings) -> list[Note]:
         told.append(Note(f"The policies were trained for different numbers of environment steps ({named})."))
     ours = results.policies[0]
     if len(found.finals) > 1 and ours.name in found.finals:
-        kept = results.trainings(ours.name).trainings[0].job
+        kept = results.trainings(ours.name).trainings[0]
         goes_on = "Our policy goes on from the imitator of a cluster, where the others begin anew. "
         text = (
-            f"{goes_on if ours.goes_on(results.config, kept) else ''}With all imitators and the readings of their "
+            f"{goes_on if kept.goes_on else ''}With all imitators and the readings of their "
             f"scores, ours took {formats.count(results.env_steps_of(ours))} environment steps."
         )
         told.append(Note(text))

@@ -25,8 +25,10 @@ class Training:
     """One of several trainings of the same policy."""
 
     job: str
+    goes_on: bool
+    """Whether it began with a policy that had been trained before."""
     env_steps: int
-    """Of the training, and of the episodes by which its candidates and its end were measured."""
+    """Of the training, and of the episodes by which its beginning, its candidates and its end were measured."""
     kept_after: int
     """Environment steps after which its policy was what is kept of it."""
     distance: float

@@ -71,7 +71,7 @@ class LaterScoresStage(Weighting):
 class FinetuningStage(PolicyStage):
     """Goes on from the final policy and its value function, with noise set anew and a fresh discriminator."""
 
-    version = 3
+    version = 4
 
     def job_settings(self, config: RunConfig) -> dict[str, Any]:
         """Return what a training depends on, the policy it begins with included."""
@@ -93,14 +93,11 @@ class FinetuningStage(PolicyStage):
         steps = config.finetuning.total_steps or max(1, gail.total_steps // SHARE_OF_STEPS)
         return gail.model_copy(update={"total_steps": steps})
 
-    def goes_on(self, config: RunConfig, job: str) -> bool:
-        """Each does."""
-        return True
-
-    def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> None:
+    def begin(self, run: Run, job: str, learner: "Learner[AdversarialReward]") -> tuple[bool, int]:
         """Take over policy and value function, with the noise that is asked for."""
         trained = _policy(run.config)
         learner.continue_from(Policy.load(trained).gaussian, load_value(trained), run.config.finetuning.initial_std)
+        return True, 0
 
 
 def _base(config: RunConfig) -> Run:

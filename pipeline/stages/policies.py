@@ -29,7 +29,7 @@ class PolicyStage(Stage):
     A competing method is an instance with a weighting of its own, registered beside it.
     """
 
-    version = 6
+    version = 7
     distributed = True
 
     def __init__(self, name: str, title: str, weighting: str | None) -> None:
@@ -59,12 +59,12 @@ class PolicyStage(Stage):
         """Return how each training is done."""
         return config.imitation.gail
 
-    def goes_on(self, config: RunConfig, job: str) -> bool:
-        """Return whether a training begins with something that has been trained before."""
-        return False
+    def begin(self, run: Run, job: str, learner: "Learner[AdversarialReward]") -> tuple[bool, int]:
+        """Bring a new learner to where a training begins.
 
-    def begin(self, run: Run, learner: "Learner[AdversarialReward]") -> None:
-        """Bring a new learner to where a training begins that `goes_on`."""
+        Return whether that is something that has been trained before, and the environment steps that it took to decide.
+        """
+        return False, 0
 
     def jobs(self, run: Run) -> list[str]:
         """Return the trainings."""
@@ -117,10 +117,8 @@ class PolicyStage(Stage):
             seen = evaluate(policy, environment.id, environment.dynamics, evaluation.episodes, key)
             return np.array([seen.mean_return, seen.std_return, seen.mean_length])
 
-        known = []
-        if self.goes_on(config, job):
-            self.begin(run, learner)
-            known = [curve_point()] if evaluation.num_points else []
+        goes_on, decided = self.begin(run, job, learner)
+        known = [curve_point()] if goes_on and evaluation.num_points else []
         candidates = Candidates(learner, environment, config.imitation.num_candidates)
         probes = [Probe("curve", evaluation.num_points, curve_point), candidates.probe]
         history = train(learner, environment, gail, probes, context, self.checkpoints(run, job))
@@ -141,8 +139,8 @@ class PolicyStage(Stage):
         final = evaluate(policy.gaussian, environment.id, environment.dynamics, evaluation.final_episodes, key)
         key = derive_key(seed, "distance")
         distance, measured = distance_of(policy.gaussian, learner.reward_model, environment, DISTANCE_EPISODES, key)
-        env_steps = policy.env_steps + candidates.env_steps(history) + measured
-        training = Training(job, env_steps, kept_after, distance, final.mean_return)
+        env_steps = policy.env_steps + candidates.env_steps(history) + measured + decided
+        training = Training(job, goes_on, env_steps, kept_after, distance, final.mean_return)
         discriminator = discriminator_file(learner.reward_model.discriminator_arrays())
         value = value_file(learner.value_arrays())
         return policy.files() | value | discriminator | curve.files() | final.files() | Trainings((training,)).files()

@@ -131,7 +131,7 @@ def test_the_noise_is_set_to_what_is_asked_for(base: oodil.RunResults, file: Pat
     assert stage.gail(config).total_steps == 1200  # a quarter of 4,800
     demonstrations = base.demonstrations
     learner = imitator(12, 3, 1000, demonstrations, np.ones(len(demonstrations)), stage.gail(config), seed=5)
-    stage.begin(Run(config, base.run.directory), learner)
+    assert stage.begin(Run(config, base.run.directory), "training-1", learner) == (True, 0)
     policy = learner.behavior_policy()
     np.testing.assert_allclose(np.exp(policy.log_std), 0.2, rtol=1e-6)
     observations = demonstrations.observations[:50].astype(np.float64)

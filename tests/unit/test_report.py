@@ -439,10 +439,8 @@ def test_what_ours_begins_with_and_takes_in_all_is_said(tmp_path: Path) -> None:
     assert results.env_steps_of(naive) == steps["naive_gail"]
     begins = "goes on from the imitator of a cluster"
     assert begins not in notes(run) and "ours took 17.5 M environment steps" in notes(run)
-    Writer(run, 2).policy("imitation", 3000.0, jobs=("training-1", "training-2"))
+    Writer(run, 2).policy("imitation", 3000.0, goes_on=True)
     assert begins in notes(run)
-    assert ours.goes_on(run.config, "training-1") and not ours.goes_on(run.config, "training-2")
-    assert not naive.goes_on(run.config, "training-1")
 
 
 def test_returns_may_be_unknown_negative_or_without_a_curve(tmp_path: Path) -> None:
