@@ -19,7 +19,7 @@ from oodil.pipeline.artifacts import RunDirectory, write_artifact
 from oodil.pipeline.data import Demonstrations, Episode
 from oodil.pipeline.datasets import encode_demonstrations
 from oodil.pipeline.environments import make_batch
-from oodil.pipeline.evaluation import run_episodes
+from oodil.pipeline.evaluation import distance_of, run_episodes
 from oodil.pipeline.loading import parse_config
 from oodil.pipeline.policy import GaussianPolicy
 from oodil.pipeline.results import (
@@ -33,7 +33,8 @@ from oodil.pipeline.results import (
 from oodil.pipeline.seeding import numpy_rng
 from oodil.pipeline.stage import Run
 from oodil.pipeline.stages.experts import load_expert
-from oodil.pipeline.stages.imitators import ImitatorsStage
+from oodil.pipeline.stages.imitation import ImitationStage
+from oodil.pipeline.stages.imitators import ClusterJob, ImitatorsStage
 from oodil.pipeline.stages.transferability import TransferabilityStage
 from oodil.workers.local_engine import LocalEngine
 from tests.runs import ROOT
@@ -135,8 +136,36 @@ def test_doing_nothing_weighs_next_to_nothing(found: tuple[Demonstrations, Trans
     assert sampling_mass(transferability.weights, shown)[IDLE].sum() < 0.05, scores
 
 
+CURVE = GaussianPolicy(
+    (np.zeros((5, 1), np.float32),),
+    (np.full(1, 0.02, np.float32),),
+    np.full(1, -10, np.float32),
+    np.zeros(5, np.float32),
+    np.ones(5, np.float32),
+)
+"""Drives on a wide curve to the left, wherever it is."""
 NOTHING = {"of no use": np.zeros(1, np.float32)}
 """Instead of networks that nobody asks."""
+
+
+def driven(path: Path, obstacle: float) -> Run:
+    """Return a run on Driving whose demonstrations, all from one start and without an obstacle, its imitator drives."""
+    free, start = {"obstacle_1": 0.05}, np.array([[-0.5, -0.8, 0, 0, np.pi / 2]], np.float32)
+    cars = make_batch("oodil/Driving-v0", free, COUNT)
+    episodes = run_episodes(cars, CURVE, numpy_rng((0,)), stochastic=False, starts=start)
+    shown = Demonstrations.of([Episode(episode.states) for episode in episodes], "on a curve")
+    environment = {"id": "oodil/Driving-v0", "dynamics": {"obstacle_1": obstacle}}
+    reading = {"steps": 300, "repetitions": 1}
+    run = prepared(path, shown, np.zeros(COUNT, np.int32), environment, reading=reading)
+    reward = ClusterJob.of(run, "cluster-0").learner(run.config).reward_model
+    distance, _ = distance_of(CURVE, reward, run.config.environment, COUNT, (0,), start)
+    imitator = Imitator(CURVE, NOTHING, NOTHING, distance, env_steps=0)
+    history = ScoreHistory(np.arange(COUNT), np.empty(0, np.int64), np.empty((0, COUNT)))
+    job = write_artifact(run.directory.job("imitators", "cluster-0"), {}, imitator.files() | history.files())
+    trained = TrainedImitators(env_steps=0, sha256={"cluster-0": job.sha256})
+    write_artifact(run.directory.stage("imitators"), {}, trained.files())
+    execute(run, [TransferabilityStage()], LocalEngine(0))
+    return run
 
 
 def test_nothing_of_what_follows_a_crash_is_reproduced(tmp_path: Path) -> None:
@@ -144,27 +173,19 @@ def test_nothing_of_what_follows_a_crash_is_reproduced(tmp_path: Path) -> None:
 
     Read up to there, it could not be told from the demonstrations.
     """
-    curve = GaussianPolicy(
-        (np.zeros((5, 1), np.float32),),
-        (np.full(1, 0.02, np.float32),),
-        np.full(1, -10, np.float32),
-        np.zeros(5, np.float32),
-        np.ones(5, np.float32),
+    free, blocked = (
+        TransferabilityStage().load(driven(tmp_path / name, obstacle)).scores
+        for name, obstacle in (("free", 0.05), ("blocked", 0.4))
     )
-    cars, start = make_batch("oodil/Driving-v0", {"obstacle_1": 0.05}, COUNT), np.array([[-0.5, -0.8, 0, 0, np.pi / 2]])
-    driven = run_episodes(cars, curve, numpy_rng((0,)), stochastic=False, starts=start.astype(np.float32))
-    shown = Demonstrations.of([Episode(episode.states) for episode in driven], "on a curve")
-    scores, reading = {}, {"steps": 300, "repetitions": 1}
-    for name, obstacle in (("free", 0.05), ("blocked", 0.4)):
-        environment = {"id": "oodil/Driving-v0", "dynamics": {"obstacle_1": obstacle}}
-        run = prepared(tmp_path / name, shown, np.zeros(COUNT, np.int32), environment, reading=reading)
-        imitator = Imitator(curve, NOTHING, NOTHING, distance=0.0, env_steps=0)
-        history = ScoreHistory(np.arange(COUNT), np.empty(0, np.int64), np.empty((0, COUNT)))
-        job = write_artifact(run.directory.job("imitators", "cluster-0"), {}, imitator.files() | history.files())
-        trained = TrainedImitators(env_steps=0, sha256={"cluster-0": job.sha256})
-        write_artifact(run.directory.stage("imitators"), {}, trained.files())
-        weighting = TransferabilityStage()
-        execute(run, [weighting], LocalEngine(0))
-        scores[name] = weighting.load(run).scores
-    assert scores["free"].min() > 0.9, scores
-    assert scores["blocked"].max() < 0.1, scores
+    assert free.min() > 0.9, free
+    assert blocked.max() < 0.1, blocked
+
+
+def test_no_policy_goes_on_from_an_imitator_that_is_lost_where_the_environment_begins(tmp_path: Path) -> None:
+    """From its one start it does exactly what was demonstrated; from the others it leaves the world."""
+    run = driven(tmp_path / "run", obstacle=0.05)
+    learner = ClusterJob.of(run, "cluster-0").learner(run.config)
+    untrained = learner.behavior_policy().arrays()
+    goes_on, steps = ImitationStage().begin(run, "training-1", learner)
+    assert not goes_on and steps > 0
+    assert all(np.array_equal(value, untrained[name]) for name, value in learner.behavior_policy().arrays().items())
