@@ -32,6 +32,7 @@ This page is written by `python docs/make_results.py` from the files of
 29 November 2026, of which "How it was made" has the times, that is the end of a training, and the distance
 that chooses among trainings [hardly saw falls](measurements.md#distances-and-returns). Until 17:00 of that day both
 trainings of ours went on from an imitator; since, [one begins anew](decisions.md#our-policy-goes-on-from-an-imitator).
+Until 20:00 what an imitator did not do any more after it had failed [was not read](measurements.md#failed-episodes).
 With five seeds or more there is the interquartile mean (IQM) with its 95 % interval; fewer are listed and have none."""
 
 
