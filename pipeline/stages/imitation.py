@@ -51,8 +51,9 @@ class ImitationStage(PolicyStage):
 
     def cost(self, config: RunConfig) -> Cost:
         """Return the cost of all trainings, and of the episodes that decide how they begin."""
-        cost = super().cost(config)
-        return replace(cost, episodes=cost.episodes + config.imitation.num_trainings * DISTANCE_EPISODES)
+        cost, section = super().cost(config), config.imitation
+        decided = (section.num_trainings + 1) // 2 if section.warm_start else 0
+        return replace(cost, episodes=cost.episodes + decided * DISTANCE_EPISODES)
 
     def begin(self, run: Run, job: str, learner: "Learner[AdversarialReward]") -> tuple[bool, int]:
         """Take over policy and value function of the cluster of which most transitions are drawn, with less noise."""

@@ -122,10 +122,10 @@ def test_what_a_run_costs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert found["imitators"].seconds == pytest.approx(estimate.START_S + 3 * seconds)
     gail = config.imitation.gail
     steps = gail.env_steps
-    # Two candidates by 8 episodes each, the policy by 16.
-    assert found["imitation"].env_steps == steps + 32_000
+    # 16 episodes of the imitator that it may go on from; two candidates by 8 each, the policy by 16.
+    assert found["imitation"].env_steps == steps + 48_000
     # One learner, whose workers share the work. Its curve is of two points by 2 episodes each, its end of 2 more.
-    seconds = (steps + 38_000) * 1e-3 + steps * 2 * LEARNING_S
+    seconds = (steps + 54_000) * 1e-3 + steps * 2 * LEARNING_S
     assert found["imitation"].seconds == pytest.approx(estimate.START_S + seconds / 2)
     # 3 and 4 demonstrations of 1000 steps, sixteen at a time.
     assert found["demonstrations"].seconds == pytest.approx(estimate.START_S + 16.0)
