@@ -50,7 +50,27 @@ the target. {_made(file, measured)}
 
 def paths() -> str:
     """Return what every weighting makes of Driving's paths, whose truth is known exactly, and what policies do."""
-    measured = json.loads((MEASURED / "driving_weights.json").read_text())
+    return f"""## Driving's paths
+
+Which paths can be reproduced is known exactly there: those at the imitator's speed that touch none of its obstacles.
+The AUROC of that truth and its share of the sampling mass, means over runs, and each run in parentheses; below, the
+share of starts from which each policy arrives, by run, and by the third of the start line.
+
+{_paths_of("driving_weights.json")}
+
+By the code before [failed episodes](measurements.md#failed-episodes) were read until the time limit:
+
+{_paths_of("driving_weights_before.json")}
+
+![Paths by source, shaded by what each weighting makes of them, over the imitator's obstacles](driving_weights.svg)
+
+Paths of the last of these runs: dark is the heaviest of a row, pale has no weight, orange are the imitator's
+obstacles and green is the goal. *marks* are those of the configuration, which leave the second source out."""
+
+
+def _paths_of(file: str) -> str:
+    """Return what one file has of Driving's paths."""
+    measured = json.loads((MEASURED / file).read_text())
     weightings, policies = [], []
     for name in dict.fromkeys(name for run in measured["runs"] for name in run["weightings"]):
         each = [run["weightings"][name] for run in measured["runs"] if name in run["weightings"]]
@@ -63,22 +83,12 @@ def paths() -> str:
         thirds = (formats.percent(fmean(one["by_third"][i] for one in each)) for i in range(3))
         policies.append((name, ", ".join(reached), ", ".join(thirds)))
     runs = ", ".join(f"{run['run']} ({run['reproducible']})" for run in measured["runs"])
-    return f"""## Driving's paths
-
-Which paths can be reproduced is known exactly there: those at the imitator's speed that touch none of its obstacles.
-The AUROC of that truth and its share of the sampling mass, means over runs, and each run in parentheses; below, the
-share of {measured["episodes"]:,} starts from which each policy arrives, by run, and by the third of the start line.
-Runs, and how many of their {measured["runs"][0]["paths"]} paths can be reproduced: {runs}.
-{_made("driving_weights.json", measured)}
+    return f"""Runs, and how many of their {measured["runs"][0]["paths"]} paths can be reproduced: {runs};
+{measured["episodes"]:,} starts. {_made(file, measured)}
 
 {lines(("weighting", "AUROC", "share before → after"), weightings, escape=False)}
 
-{lines(("policy", "starts that arrive", "left, middle and right third"), policies, escape=False)}
-
-![Paths by source, shaded by what each weighting makes of them, over the imitator's obstacles](driving_weights.svg)
-
-Paths of {measured["runs"][-1]["run"]}: dark is the heaviest of a row, pale has no weight, orange are the imitator's
-obstacles and green is the goal. *marks* are those of the configuration, which leave the second source out."""
+{lines(("policy", "starts that arrive", "left, middle and right third"), policies, escape=False)}"""
 
 
 def later() -> str:

@@ -56,8 +56,8 @@ class DemonstratedEnds:
         the time limit.
         """
         demonstrated = self.include(np.stack([episode.states[-1] for episode in episodes]))
-        failed = [episode.terminated and not ended for episode, ended in zip(episodes, demonstrated, strict=True)]
-        return [self._lasting(each) if fails else each for each, fails in zip(episodes, failed, strict=True)]
+        pairs = zip(episodes, demonstrated, strict=True)
+        return [self._lasting(each) if each.terminated and not ended else each for each, ended in pairs]
 
     def _lasting(self, episode: Episode) -> Episode:
         missing = max(0, self._max_episode_steps + 1 - len(episode.states))

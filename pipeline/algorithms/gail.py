@@ -56,7 +56,7 @@ class AdversarialReward:
         self._cumulative = np.cumsum(np.repeat(weights, demonstrations.lengths - 1))
         self._state_weights = np.repeat(weights, demonstrations.lengths)
         self._observations = demonstrations.observations
-        self._ends = DemonstratedEnds(demonstrations, weights, max_episode_steps, derive_key(root_seed, "ends"))
+        self.ends = DemonstratedEnds(demonstrations, weights, max_episode_steps, derive_key(root_seed, "ends"))
         seed = torch_seed(derive_key(root_seed, "discriminator", "initial"))
         self.discriminator = Discriminator(demonstrations, weights, config, seed)
         self._policy_inputs: tuple[TransitionBatch, Tensor] | None = None
@@ -73,7 +73,7 @@ class AdversarialReward:
 
     def goes_on(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return (E,) whether an end in each of (E, S) states is worth an endless reward: demonstrations end there."""
-        return self._ends.include(states)
+        return self.ends.include(states)
 
     def update(self, batch: TransitionBatch, iteration: int, step_scale: float) -> dict[str, float]:
         """Train the discriminator on the batch, a part of it at each step, and on as many demonstration pairs."""
@@ -94,7 +94,7 @@ class AdversarialReward:
         """
         rng = numpy_rng(derive_key(self.root_seed, "distance"))
         shown = self.draw(DISTANCE_TRANSITIONS, rng)
-        paths = [episode.states for episode in self._ends.until_limit(episodes)]
+        paths = [episode.states for episode in self.ends.until_limit(episodes)]
         states, successors = (np.concatenate([path[part] for path in paths]) for part in (np.s_[:-1], np.s_[1:]))
         return sliced_wasserstein(shown.numpy(), self.discriminator.inputs(states, successors).numpy(), rng)
 

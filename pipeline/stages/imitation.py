@@ -56,7 +56,10 @@ class ImitationStage(PolicyStage):
         return replace(cost, episodes=cost.episodes + decided * DISTANCE_EPISODES)
 
     def begin(self, run: Run, job: str, learner: "Learner[AdversarialReward]") -> tuple[bool, int]:
-        """Take over policy and value function of the cluster of which most transitions are drawn, with less noise."""
+        """Take over policy and value function of the cluster of which most transitions are drawn, with less noise.
+
+        Every second training begins anew, and so do all if that imitator is lost where the environment begins.
+        """
         config = run.config
         if not config.imitation.warm_start or int(job.removeprefix("training-")) % 2 == 0:
             return False, 0

@@ -20,7 +20,6 @@ from oodil.pipeline.stage import Cost, JobContext, Run, Stage, register
 from oodil.pipeline.stages.demonstrations import load_demonstrations
 
 if TYPE_CHECKING:
-    from oodil.pipeline.algorithms.ends import DemonstratedEnds
     from oodil.pipeline.algorithms.gail import AdversarialReward
     from oodil.pipeline.algorithms.learner import Learner
     from oodil.pipeline.algorithms.reading import LastDiscriminator, Readers
@@ -61,14 +60,6 @@ class ClusterJob:
         spec = environment_spec(config.environment.id, config.environment.dynamics)
         dims = spec.observation_dim, spec.action_dim, spec.max_episode_steps
         return imitator(*dims, self.demonstrations, np.ones(len(self.members)), config.transferability.gail, self.seed)
-
-    def ends(self, config: RunConfig) -> "DemonstratedEnds":
-        """Return where its demonstrations end."""
-        from oodil.pipeline.algorithms.ends import DemonstratedEnds
-
-        horizon = environment_spec(config.environment.id, config.environment.dynamics).max_episode_steps
-        key = derive_key(self.seed, "ends")
-        return DemonstratedEnds(self.demonstrations, np.ones(len(self.members)), horizon, key)
 
     def readers(self, config: RunConfig) -> "Readers | LastDiscriminator":
         """Return what is to read the demonstrations; it is still untrained."""

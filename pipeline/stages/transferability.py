@@ -99,8 +99,8 @@ class TransferabilityStage(Weighting):
             return Reading(cluster.members, divergences, env_steps=0, readers=imitator.discriminator).files()
         played = self._episodes(run.config, cluster, imitator.policy)
         env_steps = sum(len(episode.states) - 1 for episode in played)
-        lasting = Demonstrations.of(cluster.ends(run.config).until_limit(played), "imitator")
-        divergences = readers.train(lasting, context.progress)
+        lasting = cluster.learner(run.config).reward_model.ends.until_limit(played)
+        divergences = readers.train(Demonstrations.of(lasting, "imitator"), context.progress)
         return Reading(cluster.members, divergences, env_steps, readers.arrays()).files()
 
     def _episodes(self, config: RunConfig, cluster: ClusterJob, policy: GaussianPolicy) -> list[Episode]:

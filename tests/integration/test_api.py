@@ -116,7 +116,8 @@ def test_the_policy_acts_as_its_training_did(results: oodil.RunResults) -> None:
     far = policy.gaussian.mean(observation[None])[0]
     np.testing.assert_array_equal(action, np.clip(far, -1, 1))
     batch = policy.act(np.stack([observation, observation]))
-    np.testing.assert_allclose(batch, [action, action], rtol=1e-6, atol=1e-6)
+    # The rounding of a sum goes by its terms: an action near zero has that of one near 1.
+    np.testing.assert_allclose(batch, [action, action], rtol=1e-6, atol=np.finfo(np.float32).eps)
     with pytest.raises(oodil.OodilError, match=r"shape \(11,\); the policy was trained on \(12,\)"):
         policy.act(observation[1:])
 
